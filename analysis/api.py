@@ -280,7 +280,7 @@ def campaign(
         [Path(path) for path in paths],
         settings,
         structures=tuple(types or STRUCTURES),
-        fixed=fixed,
+        fixed_parameters=fixed,
         jobs=jobs,
-        dask=dask,
+        dask_address=dask,
     )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
 
-Band = tuple[float, float]
+FrequencyBand = tuple[float, float]
 """First and last frequency of a band in Hz."""
 
 WELCH_OMITTED_TEXT: Final = "Welch fits left out: "
@@ -57,7 +57,7 @@ _EXCITED_BAND_MARGIN_FACTOR: Final = 1.1
 excites a little beyond."""
 
 
-def highest_frequency_hz(requested_band_hz: Band | None = None) -> float:
+def highest_frequency_hz(requested_band_hz: FrequencyBand | None = None) -> float:
     """Return the highest frequency in Hz that any analysis of a record uses.
 
     Parameters
@@ -68,7 +68,7 @@ def highest_frequency_hz(requested_band_hz: Band | None = None) -> float:
     return (requested_band_hz or RECORD_BAND_HZ)[1]
 
 
-def record_band_hz(record: Record, requested_band_hz: Band | None = None) -> Band:
+def record_band_hz(record: Record, requested_band_hz: FrequencyBand | None = None) -> FrequencyBand:
     """Return the frequency band in Hz of the whole-record fits.
 
     It is the requested band, or else the default band limited by the record's sampling rate and by
@@ -84,7 +84,7 @@ def record_band_hz(record: Record, requested_band_hz: Band | None = None) -> Ban
     return requested_band_hz or _limit_band(RECORD_BAND_HZ, record)
 
 
-def check_record_band(record: Record, requested_band_hz: Band | None) -> None:
+def check_record_band(record: Record, requested_band_hz: FrequencyBand | None) -> None:
     """Raise if a record's sampling rate is too low for a band.
 
     Parameters
@@ -112,7 +112,7 @@ def check_record_band(record: Record, requested_band_hz: Band | None) -> None:
         )
 
 
-def check_excited_band(record: Record, requested_band_hz: Band | None) -> None:
+def check_excited_band(record: Record, requested_band_hz: FrequencyBand | None) -> None:
     """Raise if a requested band of the whole-record fits reaches far beyond the excitation.
 
     The angle there is noise of its sensor, which the beam does not feel. Nothing is checked if the
@@ -148,7 +148,7 @@ def check_excited_band(record: Record, requested_band_hz: Band | None) -> None:
 
 
 def welch_settings(
-    record: Record, settings: WelchSettings, requested_band_hz: Band | None = None
+    record: Record, settings: WelchSettings, requested_band_hz: FrequencyBand | None = None
 ) -> WelchSettings:
     """Return the settings of the Welch fits with the requested band or the default one.
 
@@ -189,7 +189,9 @@ def _scale_to_decimated_rate(settings: WelchSettings, record: Record) -> WelchSe
     return replace(settings, segment_length=segment_length, overlap=overlap, nfft=nfft)
 
 
-def remarks(record: Record, requested_band_hz: Band | None = None) -> tuple[str, ...]:
+def analysis_remarks(
+    record: Record, requested_band_hz: FrequencyBand | None = None
+) -> tuple[str, ...]:
     """Return sentences on adaptations of the analysis to a record, such as a lower band.
 
     Parameters
@@ -229,7 +231,7 @@ def remarks(record: Record, requested_band_hz: Band | None = None) -> tuple[str,
 def welch_analysis(
     record: Record,
     settings: WelchSettings,
-    requested_band_hz: Band | None = None,
+    requested_band_hz: FrequencyBand | None = None,
     *,
     is_optional: bool,
 ) -> tuple[WelchAnalysis | None, str | None]:
@@ -274,7 +276,9 @@ def welch_analysis(
     return None, f"{WELCH_OMITTED_TEXT}{exclusion_reason}."
 
 
-def welch_exclusion_reason(record: Record, requested_band_hz: Band | None = None) -> str | None:
+def welch_exclusion_reason(
+    record: Record, requested_band_hz: FrequencyBand | None = None
+) -> str | None:
     """Return why Welch's method is not applicable to a record, or None if it is.
 
     The reason is the end of a sentence.
@@ -335,7 +339,7 @@ def _metadata_number(record: Record, metadata_key: str) -> float | None:
         return None
 
 
-def _limit_band(band_hz: Band, record: Record) -> Band:
+def _limit_band(band_hz: FrequencyBand, record: Record) -> FrequencyBand:
     """Restrict a band to frequencies below the limit of the rate and within the recorded sweep.
 
     The whole band is returned if nothing remains.

@@ -52,7 +52,7 @@ class AnalysisOptions:
         Settings of the Welch fits.
     with_welch_fits, whole_record : bool
         Whether the Welch fits of the paper, and the fits to the whole record, are run.
-    fixed : tuple of str
+    fixed_parameters : tuple of str
         Parameters of rig and specimen that stay at the file's values.
     band_hz : tuple of float or None
         Frequency band of all fits; None selects the largest suitable band.
@@ -70,7 +70,7 @@ class AnalysisOptions:
     settings: WelchSettings
     with_welch_fits: bool
     whole_record: bool
-    fixed: tuple[Setting, ...]
+    fixed_parameters: tuple[Setting, ...]
     band_hz: tuple[float, float] | None = None
     figures: tuple[FigureFormat, ...] = DEFAULT_FORMATS
     uniformity: float | None = None
@@ -90,9 +90,9 @@ class WholeRecord:
         Candidates, selected fit and verdict.
     band_hz : tuple of float
         Frequency band of the fits.
-    fixed : tuple of str
+    fixed_parameters : tuple of str
         Parameters that stayed at the file's values.
-    added : tuple of StructureFit
+    added_fits : tuple of StructureFit
         Fits of damping structures of installed packages, in addition to the selection.
     validity : Validity
         Validity of the linear model for the record.
@@ -101,8 +101,8 @@ class WholeRecord:
     record: Record
     selection: Selection
     band_hz: tuple[float, float]
-    fixed: tuple[Setting, ...] = ()
-    added: tuple[StructureFit, ...] = ()
+    fixed_parameters: tuple[Setting, ...] = ()
+    added_fits: tuple[StructureFit, ...] = ()
     validity: Validity = field(init=False)
 
     def __post_init__(self) -> None:
@@ -145,7 +145,7 @@ class WholeRecord:
         """
         verdict = self.selection.verdict
         first_sentence, other_sentences = verdict.sentences[:1], verdict.sentences[1:]
-        added_sentences = (structure_fit.sentence for structure_fit in self.added)
+        added_sentences = (structure_fit.sentence for structure_fit in self.added_fits)
         part_text = self.record.part_text
         part_sentences = () if part_text is None else (f"All results are for {part_text}.",)
         return replace(
@@ -306,7 +306,9 @@ def _record_validity(record: Record, *plants: Plant) -> Validity:
 
 
 def whole_record(
-    record: Record, fixed: tuple[Setting, ...] = (), band_hz: tuple[float, float] | None = None
+    record: Record,
+    fixed_parameters: tuple[Setting, ...] = (),
+    band_hz: tuple[float, float] | None = None,
 ) -> WholeRecord:
     """Fit every damping structure to a whole record, and select the best supported one.
 
@@ -314,7 +316,7 @@ def whole_record(
     ----------
     record : Record
         Record of a session.
-    fixed : tuple of str
+    fixed_parameters : tuple of str
         Parameters that stay at the file's values.
     band_hz : tuple of float, optional
         Frequency band, by default the largest suitable one.
@@ -329,8 +331,8 @@ def whole_record(
 
     check_excited_band(record, band_hz)
     band_hz = record_band_hz(record, band_hz)
-    selection = select(Measurement.from_record(record), fixed=fixed, band_hz=band_hz)
-    return WholeRecord(record, selection, band_hz, fixed)
+    selection = select(Measurement.from_record(record), fixed=fixed_parameters, band_hz=band_hz)
+    return WholeRecord(record, selection, band_hz, fixed_parameters)
 
 
 def record_result(
@@ -361,9 +363,9 @@ def record_result(
         No analysis is applicable to the record, or the settings are not.
     """
     from analysis.applicability import (
+        analysis_remarks,
         check_record_band,
         highest_frequency_hz,
-        remarks,
         welch_analysis,
     )
     from analysis.identify import MeasurementError
@@ -372,7 +374,7 @@ def record_result(
 
     record = load_record(path, options.part_s, highest_hz=highest_frequency_hz(options.band_hz))
     record = with_uniformity(record, options.uniformity)
-    record = _add_warnings(record, remarks(record, options.band_hz))
+    record = _add_warnings(record, analysis_remarks(record, options.band_hz))
     on_step("read")
     if not options.with_welch_fits:
         check_record_band(record, options.band_hz)
@@ -416,7 +418,7 @@ def _fit_whole_record(
     record: Record, options: AnalysisOptions, warn: Callable[[str], None]
 ) -> WholeRecord:
     """Fit all structures to a whole record, including the selected ones of installed packages."""
-    whole_fits = whole_record(record, options.fixed, options.band_hz)
+    whole_fits = whole_record(record, options.fixed_parameters, options.band_hz)
     return _add_structure_fits(whole_fits, options.structures, warn)
 
 
@@ -432,20 +434,22 @@ def _add_structure_fits(
     from rigd.plugins import PluginError
 
     structure_fits = []
-    for added in structures:
+    for added_structure in structures:
         try:
-            structure_fit = fit_structure(added, whole_fits.selection, whole_fits.fixed)
+            structure_fit = fit_structure(
+                added_structure, whole_fits.selection, whole_fits.fixed_parameters
+            )
         except PluginError as error:
             warn(f"{whole_fits.record.path}: {error}")
             continue
         if structure_fit is None:
             warn(
                 f"{whole_fits.record.path}: the record shows an effect beyond the damping of a "
-                f"beam, with which the structure {added.structure.name} is not fitted."
+                f"beam, with which the structure {added_structure.structure.name} is not fitted."
             )
         else:
             structure_fits.append(structure_fit)
-    return replace(whole_fits, added=tuple(structure_fits))
+    return replace(whole_fits, added_fits=tuple(structure_fits))
 
 
 def with_uniformity(record: Record, uniformity: float | None) -> Record:

@@ -130,7 +130,9 @@ def analyzer_document(path: Path, *, command_line: bool) -> tuple[str, float]:
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         return done.stdout, time.monotonic() - start
-    options = AnalysisOptions(WelchSettings(), with_welch_fits=False, whole_record=True, fixed=())
+    options = AnalysisOptions(
+        WelchSettings(), with_welch_fits=False, whole_record=True, fixed_parameters=()
+    )
     start = time.process_time()
     result = record_result(path, options)
     spent_s = time.process_time() - start

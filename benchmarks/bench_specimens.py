@@ -85,7 +85,7 @@ def line(case: Case, found: CampaignResult) -> str:
     least = min(each.p_value for each in alike.quantities)
     mixed = "no"
     if (leading := alike.leading_scatter) is not None:
-        sizes = " and ".join(str(len(group)) for group in leading.groups)
+        sizes = " and ".join(str(len(group)) for group in leading.session_groups)
         stds = f"{leading.relative_between_session_std:.0f} std"
         mixed = f"yes, {sizes or 'no groups'}, by {leading.quantity} ({stds})"
     worst = "" if alike.is_mixture else f"{worst_error(case, found):.1f}"

@@ -137,10 +137,10 @@ def campaign(
     settings: WelchSettings | None = None,
     *,
     structures: Sequence[str] = tuple(STRUCTURES),
-    fixed: Sequence[Setting] = (),
+    fixed_parameters: Sequence[Setting] = (),
     band_hz: tuple[float, float] | None = None,
     jobs: int | None = None,
-    dask: str | None = None,
+    dask_address: str | None = None,
     uniformity: float | None = None,
     workers: Workers | None = None,
     on_progress: Callable[[int, int, str], None] = lambda _done_steps, _total_steps, _step_name: (
@@ -162,20 +162,20 @@ def campaign(
     structures : sequence of str
         Structures of the whole-record fits to choose from. An empty sequence omits these fits,
         the verdict and the validation of the fits.
-    fixed : sequence of str
+    fixed_parameters : sequence of str
         Parameters of rig and specimen that stay at the file's values in the whole-record fits.
     band_hz : tuple of float, optional
         Frequency band of all fits and of the validation; by default chosen for each record.
     jobs : int, optional
         Number of worker processes, by default one per core.
-    dask : str, optional
+    dask_address : str, optional
         Address of a Dask scheduler whose workers are used instead of processes on this machine.
         These workers need the files under the same absolute paths.
     uniformity : float, optional
         Relative standard deviation of each mode's frequency from the frequency of a uniform beam,
         instead of the value stated in the files.
     workers : Workers, optional
-        Existing workers, used instead of `jobs` and `dask`. They remain open.
+        Existing workers, used instead of `jobs` and `dask_address`. They remain open.
     on_progress : callable, optional
         Called after each step with the number of finished steps, the number of all steps, and the
         name of the file.
@@ -192,10 +192,12 @@ def campaign(
     """
     if not paths:
         raise CampaignError("A campaign needs session files, and none was given.")
-    if dask is not None:
+    if dask_address is not None:
         paths = [path.absolute() for path in paths]
     settings = settings or WelchSettings()
-    session_task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz, uniformity)
+    session_task = SessionTask(
+        settings, tuple(structures), tuple(fixed_parameters), band_hz, uniformity
+    )
     done_steps, total_steps = 0, 2 * len(paths)
 
     def report_step(file_name: str) -> None:
@@ -207,8 +209,8 @@ def campaign(
     workers_manager: AbstractContextManager[Workers]
     if workers is not None:
         workers_manager = nullcontext(workers)
-    elif dask is not None:
-        workers_manager = dask_cluster(dask)
+    elif dask_address is not None:
+        workers_manager = dask_cluster(dask_address)
     else:
         workers_manager = process_pool(min(jobs or available_cores(), len(paths)))
     with workers_manager as ready_workers:
@@ -427,7 +429,10 @@ def _exclusion_reason(
     for other_session in accepted_sessions:
         if session_result.path == other_session.path:
             return "the file is given more than once, and counts once."
-        if session_result.experiment.identity == other_session.experiment.identity:
+        if (
+            session_result.experiment.session_identifiers
+            == other_session.experiment.session_identifiers
+        ):
             return f"it is the same session as {other_session.path}, which would count twice."
         if session_result.digests & other_session.digests:
             return (

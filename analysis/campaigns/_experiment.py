@@ -90,23 +90,23 @@ class Experiment:
         Values by their keys in the session file. Optional values that are not stated are absent.
     sweep_s : float
         Duration of the recorded sweep in seconds.
-    identity : tuple of str
+    session_identifiers : tuple of str
         Identifiers of the session, equal in copies of its file; the path of a file without them.
     start_utc : str
         Start of the recording in UTC, to the second; empty if the file does not state it.
     operator, note : str
         Operator and note stated in the file; empty if not stated.
-    added : mapping of str to (float or str)
+    added_metadata : mapping of str to (float or str)
         Metadata that the user added, by its names, such as ``temperature_c``.
     """
 
     facts: Mapping[str, str | float]
     sweep_s: float
-    identity: tuple[str, ...]
+    session_identifiers: tuple[str, ...]
     start_utc: str = ""
     operator: str = ""
     note: str = ""
-    added: Mapping[str, float | str] = field(default_factory=dict)
+    added_metadata: Mapping[str, float | str] = field(default_factory=dict)
 
     @classmethod
     def from_record(cls, record: Record) -> Experiment:
@@ -127,7 +127,7 @@ class Experiment:
                 **excitation_facts,
             },
             sweep_s=record.sweep_samples / record.rate_hz,
-            identity=(
+            session_identifiers=(
                 (metadata["id"], metadata["start_utc_ns"])
                 if {"id", "start_utc_ns"} <= metadata.keys()
                 else (str(record.path.resolve()),)
@@ -135,11 +135,11 @@ class Experiment:
             start_utc=_utc_text(metadata.get("start_utc_ns", "")),
             operator=metadata.get("operator", "").strip(),
             note=metadata.get("note", "").strip(),
-            added=added_metadata(metadata),
+            added_metadata=added_metadata(metadata),
         )
 
     @property
-    def label(self) -> str:
+    def specimen_label(self) -> str:
         """Label of the specimen stated in the file; empty if the file states none."""
         return str(self.facts.get(_SPECIMEN_LABEL_KEY, ""))
 
@@ -252,12 +252,12 @@ class StatedSpecimen:
     ----------
     facts : mapping of str to (str or float)
         Properties of beam and tool by their keys in the session files.
-    files : tuple of str
+    file_names : tuple of str
         Names of the files that state this specimen, whether they can be used or not.
     """
 
     facts: Mapping[str, str | float]
-    files: tuple[str, ...]
+    file_names: tuple[str, ...]
 
 
 def stated_specimens(

@@ -61,7 +61,7 @@ class Heterogeneity:
     ----------
     quantity : str
         Name of the parameter, or ``frequency_hz_N`` or ``damping_ratio_N`` of mode N.
-    values : tuple of (str, float, float)
+    session_estimates : tuple of (str, float, float)
         File, estimate and its standard deviation, one entry for each session.
     mean : float
         Pooled mean; the geometric mean of a positive parameter.
@@ -73,23 +73,23 @@ class Heterogeneity:
         p-value of `cochran_q`.
     is_mixture : bool
         Whether the sessions differ so much that the mean is that of a mixture of specimens.
-    groups : tuple of tuple of str
+    session_groups : tuple of tuple of str
         Files of each group of sessions, by increasing value; empty without clear gaps.
     """
 
     quantity: str
-    values: SessionEstimates
+    session_estimates: SessionEstimates
     mean: float
     between_session_std: float
     cochran_q: float
     p_value: float
     is_mixture: bool
-    groups: tuple[tuple[str, ...], ...]
+    session_groups: tuple[tuple[str, ...], ...]
 
     @property
     def degrees_of_freedom(self) -> int:
         """Degrees of freedom of Cochran's Q: the number of sessions less one."""
-        return len(self.values) - 1
+        return len(self.session_estimates) - 1
 
     @property
     def relative_between_session_std(self) -> float:
@@ -261,7 +261,7 @@ def _test_heterogeneity(
     q = float(pooled_effects.cochran_q[0])
     return Heterogeneity(
         quantity=quantity,
-        values=session_estimates,
+        session_estimates=session_estimates,
         mean=mean,
         between_session_std=float(pooled_effects.between_session_std[0])
         * (mean if is_logarithmic else 1.0),
@@ -271,7 +271,7 @@ def _test_heterogeneity(
         and (
             bool(session_groups) or q * (1 - _MIN_MIXTURE_I_SQUARED) >= len(session_estimates) - 1
         ),
-        groups=tuple(
+        session_groups=tuple(
             tuple(session_estimates[session_index][0] for session_index in sorted(group))
             for group in session_groups
         ),

@@ -218,13 +218,13 @@ def _constants_and_background(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the modal constants and the background of a session in one vector, with covariance."""
     constant_indices = estimate.rows(mode_numbers)
-    indices = np.concatenate(
+    joint_indices = np.concatenate(
         [constant_indices, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
     )
     constants_and_background = np.concatenate(
         [estimate.constants[constant_indices], estimate.model.background]
     )
-    return constants_and_background, estimate.joint_covariance[np.ix_(indices, indices)]
+    return constants_and_background, estimate.joint_covariance[np.ix_(joint_indices, joint_indices)]
 
 
 # Rising and falling sweeps

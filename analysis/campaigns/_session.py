@@ -147,9 +147,9 @@ class SessionTask:
     ----------
     settings : WelchSettings
         Settings of the Welch fits.
-    structures : tuple of str
+    structure_names : tuple of str
         Structures of the whole-record fits to retain; empty for no such fits.
-    fixed : tuple of str
+    fixed_parameters : tuple of str
         Parameters that stay at the file's values in the whole-record fits.
     band_hz : tuple of float or None
         Frequency band of all fits; None chooses it for each record.
@@ -159,8 +159,8 @@ class SessionTask:
     """
 
     settings: WelchSettings
-    structures: tuple[str, ...]
-    fixed: tuple[Setting, ...]
+    structure_names: tuple[str, ...]
+    fixed_parameters: tuple[Setting, ...]
     band_hz: tuple[float, float] | None
     uniformity: float | None = None
 
@@ -177,7 +177,7 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
     session_task : SessionTask
         Settings of the analysis.
     """
-    from analysis.applicability import highest_frequency_hz, remarks, welch_analysis
+    from analysis.applicability import analysis_remarks, highest_frequency_hz, welch_analysis
     from analysis.record import load_record
 
     session_errors = session_error_types()
@@ -195,7 +195,7 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
             record,
             session_task.settings,
             session_task.band_hz,
-            is_optional=bool(session_task.structures),
+            is_optional=bool(session_task.structure_names),
         )
     except session_errors as error:
         return SessionFailure(path, str(error), experiment)
@@ -204,13 +204,15 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
     warnings = record.warnings if welch_results is None else welch_results.warnings
     warnings = (
         *warnings,
-        *remarks(record, session_task.band_hz),
+        *analysis_remarks(record, session_task.band_hz),
         *((omission_remark,) if omission_remark else ()),
     )
     record_result = None
-    if session_task.structures:
+    if session_task.structure_names:
         try:
-            record_result = whole_record(record, session_task.fixed, session_task.band_hz)
+            record_result = whole_record(
+                record, session_task.fixed_parameters, session_task.band_hz
+            )
         except session_errors as error:
             if welch_results is None:
                 return SessionFailure(path, str(error), experiment)
@@ -264,7 +266,9 @@ def _session_result(
         ),
         record_estimates=()
         if whole_fits is None
-        else _record_estimates(whole_fits, session_task.structures, measured_response, delay_s),
+        else _record_estimates(
+            whole_fits, session_task.structure_names, measured_response, delay_s
+        ),
         verdict=None if whole_fits is None else whole_fits.verdict,
         warnings=warnings,
         headline=None if whole_fits is None else whole_fits.headline_json(),

@@ -40,28 +40,28 @@ class ParameterBias:
     ----------
     parameter : str
         Name of the parameter.
-    welch, welch_std : float
+    welch_mean, welch_std : float
         Mean of the Welch fits, and their standard deviation between sessions.
-    record, record_std : float
+    record_estimate, record_std : float
         Pooled whole-record estimate, and its standard deviation.
     bias : float
-        `welch` minus `record`.
+        `welch_mean` minus `record_estimate`.
     bias_std : float
         Standard deviation of `bias`.
-    significant : bool
+    is_significant : bool
         Whether `bias` differs from zero at the level of 0.1 % (Student's t).
     at_bounds : int
         Number of sessions whose Welch fit has the parameter at a bound of the range searched.
     """
 
     parameter: str
-    welch: float
+    welch_mean: float
     welch_std: float
-    record: float
+    record_estimate: float
     record_std: float
     bias: float
     bias_std: float
-    significant: bool
+    is_significant: bool
     at_bounds: int
 
 
@@ -91,7 +91,7 @@ class WelchBias:
     @property
     def significant_parameters(self) -> tuple[ParameterBias, ...]:
         """Parameters whose bias is significant."""
-        return tuple(parameter for parameter in self.parameters if parameter.significant)
+        return tuple(parameter for parameter in self.parameters if parameter.is_significant)
 
 
 def welch_biases(
@@ -130,13 +130,13 @@ def welch_biases(
             parameter_biases.append(
                 ParameterBias(
                     parameter=parameter_name,
-                    welch=welch_mean,
+                    welch_mean=welch_mean,
                     welch_std=std,
-                    record=pooled_parameter.value,
+                    record_estimate=pooled_parameter.value,
                     record_std=pooled_parameter.std,
                     bias=bias,
                     bias_std=bias_std,
-                    significant=abs(bias) > significance_limit * bias_std,
+                    is_significant=abs(bias) > significance_limit * bias_std,
                     at_bounds=sum(parameter_name in model.fit.at_bounds for model in welch_models),
                 )
             )

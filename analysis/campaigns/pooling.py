@@ -502,8 +502,10 @@ def _covariance_block(
     estimate: RecordEstimate, parameter_names: Sequence[str]
 ) -> NDArray[np.float64]:
     """Return the covariance of some parameters of an estimate."""
-    indices = [estimate.fit.determined.index(parameter_name) for parameter_name in parameter_names]
-    return estimate.fit.covariance[np.ix_(indices, indices)]
+    parameter_indices = [
+        estimate.fit.determined.index(parameter_name) for parameter_name in parameter_names
+    ]
+    return estimate.fit.covariance[np.ix_(parameter_indices, parameter_indices)]
 
 
 def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) -> Plant:

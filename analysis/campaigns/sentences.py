@@ -385,10 +385,12 @@ def _bias_clause(parameter_bias: ParameterBias) -> str:
     """Describe the value of one parameter of a Welch fit and its bias."""
     symbol, display_factor, display_unit = label_and_unit(parameter_bias.parameter)
     value_text, scatter_text = to_uncertainty(
-        (parameter_bias.welch, parameter_bias.welch_std), parameter_bias.welch_std, display_factor
+        (parameter_bias.welch_mean, parameter_bias.welch_std),
+        parameter_bias.welch_std,
+        display_factor,
     )
     (record_text,) = to_uncertainty(
-        (parameter_bias.record,), parameter_bias.record_std, display_factor
+        (parameter_bias.record_estimate,), parameter_bias.record_std, display_factor
     )
     (bias_text,) = to_uncertainty(
         (abs(parameter_bias.bias),), parameter_bias.bias_std, display_factor

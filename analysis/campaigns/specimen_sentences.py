@@ -65,7 +65,7 @@ def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]
             for key in differing_keys
             if key in specimen.facts
         )
-        + f" in {_list_files(specimen.files)}"
+        + f" in {_list_files(specimen.file_names)}"
         for specimen in specimens
     )
     first_specimen = ", ".join(
@@ -143,16 +143,19 @@ def _describe_groups(scatter: Heterogeneity) -> str:
     """Describe the groups of sessions or, if there are none, the sessions with extreme values."""
     quantity_label, _, _ = label_and_unit(scatter.quantity)
     values_by_file = {
-        file_name: (session_value, std) for file_name, session_value, std in scatter.values
+        file_name: (session_value, std)
+        for file_name, session_value, std in scatter.session_estimates
     }
-    if scatter.groups:
+    if scatter.session_groups:
         groups_text = "; ".join(
             f"{_mean_text([values_by_file[file_name][0] for file_name in group], scatter)} in "
             f"{_list_files(group)}"
-            for group in scatter.groups
+            for group in scatter.session_groups
         )
-        return f"By the {quantity_label} they are {len(scatter.groups)} groups: {groups_text}."
-    lowest_session, highest_session = _extreme_sessions(scatter.values)
+        return (
+            f"By the {quantity_label} they are {len(scatter.session_groups)} groups: {groups_text}."
+        )
+    lowest_session, highest_session = _extreme_sessions(scatter.session_estimates)
     return (
         f"There are no clear groups: the {quantity_label} goes from "
         f"{_mean_text([lowest_session[1]], scatter)} in {lowest_session[0]} "

@@ -392,7 +392,7 @@ def analyze(
         settings,
         with_welch_fits=method != "record",
         whole_record=method != "welch",
-        fixed=_fixed_parameters(fix),
+        fixed_parameters=_fixed_parameters(fix),
         band_hz=band_hz(band),
         figures=_figure_formats(figures),
         uniformity=None if uniformity is None else _relative_uniformity(uniformity),
@@ -421,7 +421,7 @@ def analyze(
                 exit_code = campaign_command(
                     files, settings, output_options,
                     structures=tuple(STRUCTURES) if options.whole_record else (),
-                    fixed=options.fixed, band_hz=options.band_hz, jobs=jobs, dask=dask,
+                    fixed=options.fixed_parameters, band_hz=options.band_hz, jobs=jobs, dask=dask,
                     uniformity=options.uniformity, with_paper=paper, formats=options.figures,
                 )  # fmt: skip
             except SingleSessionError as single:

@@ -89,8 +89,8 @@ def campaign_command(
     folder_source = files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_NAME)
     (report_folder,) = report_folders([folder_source], outputs.report, overwrite=outputs.overwrite)
     run_campaign = partial(
-        campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
-        dask=dask, uniformity=uniformity,
+        campaign, files, settings, structures=structures, fixed_parameters=fixed, band_hz=band_hz,
+        jobs=jobs, dask_address=dask, uniformity=uniformity,
     )  # fmt: skip
     campaign_result = _analyse_and_write(
         run_campaign, len(files), report_folder, outputs, with_paper=with_paper, formats=formats

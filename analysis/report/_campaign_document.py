@@ -63,7 +63,7 @@ def campaign_document(
             ],
             "one_specimen": campaign.homogeneity.is_one_specimen,
             "groups": leading_quantity
-            and {"quantity": leading_quantity.quantity, "files": leading_quantity.groups},
+            and {"quantity": leading_quantity.quantity, "files": leading_quantity.session_groups},
             "trials": {
                 "asked": campaign.trials,
                 "done": campaign.trials - len(campaign.failed_predictions),

@@ -99,7 +99,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
         metadata_name
         for experiment in experiments
         if experiment
-        for metadata_name in experiment.added
+        for metadata_name in experiment.added_metadata
     )
     return Table.from_rows(
         "session_list",
@@ -116,12 +116,12 @@ def session_list_table(campaign: CampaignResult) -> Table:
             (
                 Cell(str(session.path), session.name),
                 text_cell(experiment.start_utc if experiment else ""),
-                text_cell(experiment.label if experiment else ""),
+                text_cell(experiment.specimen_label if experiment else ""),
                 text_cell(experiment.operator if experiment else ""),
                 text_cell(experiment.note if experiment else ""),
                 *(
                     _added_metadata_cell(
-                        experiment.added.get(metadata_name) if experiment else None
+                        experiment.added_metadata.get(metadata_name) if experiment else None
                     )
                     for metadata_name in metadata_names
                 ),
@@ -279,7 +279,7 @@ def validation_summary(campaign: CampaignResult) -> Table:
 def sessions_table(campaign: CampaignResult) -> Table:
     """Return the table with one row for each session's verdict and for each excluded file."""
     leading_quantity = campaign.homogeneity.leading_scatter
-    session_groups = leading_quantity.groups if leading_quantity else ()
+    session_groups = leading_quantity.session_groups if leading_quantity else ()
     group_by_file = {
         file_name: f"{group_number}"
         for group_number, group_files in enumerate(session_groups, 1)

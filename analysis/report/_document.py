@@ -205,12 +205,12 @@ def record_entries(
                     for order_estimate in whole_record.orders
                 },
                 "band_hz": list(whole_record.band_hz),
-                "fixed": list(whole_record.fixed),
+                "fixed": list(whole_record.fixed_parameters),
                 "hum": [asdict(spectral_line) for spectral_line in whole_record.analysis.lines],
                 "curves": _curves_json(whole_record),
                 "added_structures": [
                     _added_structure_json(structure_fit, whole_record)
-                    for structure_fit in whole_record.added
+                    for structure_fit in whole_record.added_fits
                 ],
             }
         ],

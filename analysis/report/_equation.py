@@ -340,7 +340,7 @@ def types_table(whole_record: WholeRecord) -> Table:
             'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '
             "mode with its own stiffness. The marked type is that of the reported numbers.",
         ),
-        selected=list(STRUCTURES).index(_reported_structure(whole_record).name),
+        highlighted_row=list(STRUCTURES).index(_reported_structure(whole_record).name),
     )
 
 

@@ -98,13 +98,13 @@ def structures_table(whole_record: WholeRecord) -> Table:
             "the CSV "
             "file only, with the sums of squares.",
         ),
-        selected=list(whole_record.fits).index(whole_record.headline.name),
+        highlighted_row=list(whole_record.fits).index(whole_record.headline.name),
     )
 
 
 def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
     """Return the table of the fits of structures from installed packages; empty without any."""
-    if not whole_record.added:
+    if not whole_record.added_fits:
         return ()
     table_rows: list[tuple[Entry, ...]] = [
         (
@@ -120,7 +120,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
             fit.package,
             fit.compared_with,
         )
-        for fit in whole_record.added
+        for fit in whole_record.added_fits
         for parameter in fit.structure.parameters
     ]
     table = Table.from_rows(
@@ -145,7 +145,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
             "structures are compared with the types, but are not candidates of the verdict. * at "
             "the limit of the search range.",
         ),
-        grouped=True,
+        is_grouped=True,
     )
     return (table,)
 
@@ -161,7 +161,7 @@ def _highlighted_row_text(whole_record: WholeRecord) -> str:
 
 def _hidden_cell(cell: Cell) -> Cell:
     """Return a cell that is displayed as a dash, but whose number is written to the CSV file."""
-    return cell if cell.value is None else replace(cell, text=ABSENT_TEXT, doubtful=True)
+    return cell if cell.value is None else replace(cell, text=ABSENT_TEXT, is_doubtful=True)
 
 
 def _damping_columns() -> list[Column]:
@@ -272,7 +272,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
             "is often larger; whole-record fits do not have it.",
             *([_AT_LIMIT_NOTE] if any(fit.at_bounds for fit in fits) else []),
         ),
-        grouped=True,
+        is_grouped=True,
     )  # fmt: skip
 
 
@@ -328,7 +328,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
         ),
         table_rows,
         (_FIT_INDEX_UNITS_NOTE,),
-        grouped=True,
+        is_grouped=True,
     )  # fmt: skip
 
 
@@ -369,8 +369,8 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
             ),
         ),
         ("First row: the peaks; below: absolute deviations, as in the paper's Table 4.",),
-        selected=0,
-        grouped=True,
+        highlighted_row=0,
+        is_grouped=True,
     )
 
 
@@ -435,5 +435,5 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
             for fitted_model in fitted_models
         ),
         table_notes,
-        grouped=True,
+        is_grouped=True,
     )

@@ -146,7 +146,7 @@ def table3(campaign: CampaignResult, *, with_paper_values: bool = False) -> Tabl
             ),
             *([_PARENTHESES_NOTE] if with_paper_values else []),
         ),
-        grouped=True,
+        is_grouped=True,
     )
 
 
@@ -210,7 +210,7 @@ def table4(campaign: CampaignResult, *, with_paper_values: bool = False) -> Tabl
             "A nominal model has the mean of the sessions' parameters.",
             *([_PARENTHESES_NOTE] if with_paper_values else []),
         ),
-        grouped=True,
+        is_grouped=True,
     )
 
 
@@ -308,7 +308,7 @@ def fit_indices_table(campaign: CampaignResult) -> Table:
         ),
         tuple(table_rows),
         ("Eqs. 28 to 30, mean and standard deviation over the sessions, as in Figure 7.",),
-        grouped=True,
+        is_grouped=True,
     )  # fmt: skip
 
 
@@ -321,10 +321,12 @@ def bias_table(campaign: CampaignResult) -> Table:
         for parameter in fit_bias.parameters:
             parameter_symbol, display_factor = _TABLE_3_HEADINGS[parameter.parameter]
             welch_cell = estimate_cells(
-                (parameter.welch, parameter.welch_std), parameter.welch_std, display_factor
+                (parameter.welch_mean, parameter.welch_std), parameter.welch_std, display_factor
             )
             record_cell = estimate_cells(
-                (parameter.record, parameter.record_std), parameter.record_std, display_factor
+                (parameter.record_estimate, parameter.record_std),
+                parameter.record_std,
+                display_factor,
             )
             bias_cells: dict[str, Entry] = dict(
                 zip(
@@ -347,7 +349,7 @@ def bias_table(campaign: CampaignResult) -> Table:
                         0
                     ],
                     "bias_std": parameter.bias_std,
-                    "significant": parameter.significant,
+                    "significant": parameter.is_significant,
                     "reported": parameter.parameter not in unreported_names,
                     "wmse": fit_bias.wmse,
                     "record_wmse": fit_bias.record_wmse,
@@ -369,7 +371,7 @@ def bias_table(campaign: CampaignResult) -> Table:
             "level. A bias is the same in every session: it does not show in the std of Table 3.",
             *footnotes(unsupported_orders),
         ),
-        grouped=True,
+        is_grouped=True,
     )  # fmt: skip
 
 

@@ -96,7 +96,7 @@ def structures_table(campaign: CampaignResult) -> Table:
                 else (NOT_POOLED_NOTE,)
             ),
         ),
-        selected=0 if campaign.pooled else None,
+        highlighted_row=0 if campaign.pooled else None,
     )
 
 
@@ -252,7 +252,7 @@ def _pooled_row(
         value_cell = (
             grey_cell(value_cell)
             if homogeneity.is_mixed(parameter.name)
-            else replace(value_cell, strong=True)
+            else replace(value_cell, is_strong=True)
         )
     return {
         "type": pooled_estimate.structure,
@@ -330,7 +330,7 @@ def tolerance_table(campaign: CampaignResult) -> Table:
                 ),
                 "value": mark_cell(value_cell)
                 if reported_value.flag
-                else replace(value_cell, strong=True),
+                else replace(value_cell, is_strong=True),
                 **dict(zip(("std", "low_95", "high_95"), further_cells, strict=True)),
                 **dict(
                     zip(
@@ -489,13 +489,13 @@ def specimens_table(campaign: CampaignResult) -> Table:
                     key: Cell(stated_value, fact_text(key, stated_value))
                     for key, stated_value in specimen.facts.items()
                 },
-                "files": len(specimen.files),
+                "files": len(specimen.file_names),
                 "here": specimen is stated_specimens[0],
-                "names": Cell(" ".join(specimen.files), ", ".join(specimen.files)),
+                "names": Cell(" ".join(specimen.file_names), ", ".join(specimen.file_names)),
             }
             for specimen in stated_specimens
         ),
-        selected=0,
+        highlighted_row=0,
     )
 
 
@@ -512,7 +512,7 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
                     symbol_with_unit(scatter.quantity), scatter.quantity, homogeneity
                 ),
             ),
-            "sessions": len(scatter.values),
+            "sessions": len(scatter.session_estimates),
             "mean": number_cell(scatter.mean, f".{_decimals_of_scatter(scatter)}f", display_factor),
             "between_std": number_cell(scatter.between_session_std, ".2g", display_factor),
             "between_in_own_std": scatter.relative_between_session_std,
@@ -553,7 +553,7 @@ def _decimals_of_scatter(scatter: Heterogeneity) -> int:
     """
     _, display_factor, _ = label_and_unit(scatter.quantity)
     shown_std = display_factor * max(
-        scatter.between_session_std, min(std for _, _, std in scatter.values)
+        scatter.between_session_std, min(std for _, _, std in scatter.session_estimates)
     )
     return min(decimals(shown_std), 9)
 

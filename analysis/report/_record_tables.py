@@ -270,7 +270,7 @@ def _scale_notes(whole_record: WholeRecord) -> Iterator[str]:
     """Yield notes that state which uncertainties of scales the intervals include or omit."""
     if not parameters_compensate_scales(whole_record.fit):
         held_parameters = ", ".join(
-            parameter_named(scale_key).symbol for scale_key in whole_record.fixed
+            parameter_named(scale_key).symbol for scale_key in whole_record.fixed_parameters
         )
         yield (
             f"Intervals are statistical only: the file's values of {held_parameters}, "
@@ -613,7 +613,7 @@ def _correlation_cell(is_diagonal: bool, correlation_value: float) -> Cell:
     correlation_cell = number_cell(correlation_value, ".3f")
     if is_diagonal or abs(correlation_value) < _STRONG_CORRELATION:
         return correlation_cell
-    return replace(correlation_cell, strong=True)
+    return replace(correlation_cell, is_strong=True)
 
 
 def amplitude_tables(whole_record: WholeRecord) -> tuple[Table, ...]:

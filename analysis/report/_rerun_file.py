@@ -120,7 +120,7 @@ class ChartCurve:
 
     name: str
     legend_entry: LegendEntry
-    values: RealArray
+    curve_values: RealArray
     dotted: bool = False
 
 
@@ -210,7 +210,7 @@ def _draw_page(fit_page: ChartPage, stream: RecordingStream) -> None:
     for graph in fit_page.graphs:
         graph.chart.draw_frame(stream)
         for curve_order, curve in enumerate(graph.curves):
-            curve_strips = decimation.strips(curve.values)
+            curve_strips = decimation.strips(curve.curve_values)
             graph.chart.draw_curve(
                 stream,
                 curve.name,
@@ -424,9 +424,9 @@ class PlotOverTime:
 
     entity: str
     title: str
-    names: tuple[str, ...]
-    colors: tuple[Color, ...]
-    widths: tuple[float, ...]
+    curve_names: tuple[str, ...]
+    curve_colors: tuple[Color, ...]
+    curve_widths: tuple[float, ...]
     compute_values: Callable[[TorqueInBand], RealArray]
 
 
@@ -587,9 +587,9 @@ def _time_plot_view(
     start_boundary = rrb.TimeRangeBoundary.absolute(seconds=0.0)
     end_boundary = rrb.TimeRangeBoundary.absolute(seconds=session_end_s)
     series_style = rr.SeriesLines(
-        names=time_plot.names,
-        colors=time_plot.colors,
-        widths=time_plot.widths,
+        names=time_plot.curve_names,
+        colors=time_plot.curve_colors,
+        widths=time_plot.curve_widths,
         # The default averages the values of a pixel, which understates peaks.
         aggregation_policy="MinMax",
     )
@@ -597,7 +597,7 @@ def _time_plot_view(
         name=time_plot.title,
         origin=time_plot.entity,
         overrides={time_plot.entity: series_style},
-        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(time_plot.names) > 1),
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(time_plot.curve_names) > 1),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start_boundary, end=end_boundary)),
         axis_y=rrb.ScalarAxis(range=_labelled_axis_range(largest_value)),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start_boundary, end=end_boundary),

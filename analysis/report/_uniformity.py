@@ -172,5 +172,5 @@ def uniformity_table(uniformity_test: UniformBeamTest) -> Table:
             "N·m/s; phase of the residue over j, in rad.",
             uniformity_test.summary.sentence,
         ),
-        grouped=True,
+        is_grouped=True,
     )

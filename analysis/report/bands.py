@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rigd.beam import Plant
 
     # Lowest and highest frequency of a band, in hertz.
-    Band = tuple[float, float]
+    FrequencyBand = tuple[float, float]
 
     # Array of real numbers.
     RealArray = NDArray[np.float64]
@@ -38,7 +38,7 @@ _MIN_POWER_TO_NOISE_RATIO: Final = 4.0
 By chance the ratio exceeds 2 in one of 10 000 blocks."""
 
 
-def supported_band_hz(whole_record: WholeRecord) -> Band | None:
+def supported_band_hz(whole_record: WholeRecord) -> FrequencyBand | None:
     """Return the frequency band in which the data support the selected fit's loss factors.
 
     The modes determine the damping. A model whose orders the data support is valid in the whole
@@ -60,7 +60,7 @@ def supported_band_hz(whole_record: WholeRecord) -> Band | None:
     return min(mode_frequencies_hz), max(mode_frequencies_hz)
 
 
-def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
+def excited_band_hz(record: Record, analysis: RecordAnalysis) -> FrequencyBand | None:
     """Return the lowest and highest frequency at which the torque is stronger than the noise.
 
     Parameters

@@ -217,7 +217,7 @@ def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
         ),
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole_record.analysis.frequency_hz.size} bins"),
         ("types", ", ".join(whole_record.fits)),
-        ("fixed at the file's values", ", ".join(whole_record.fixed) or "none"),
+        ("fixed at the file's values", ", ".join(whole_record.fixed_parameters) or "none"),
         ("narrow-band disturbances removed", "; ".join(hum_texts) or "none found"),
         (
             "intervals and bands",

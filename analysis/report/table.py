@@ -44,16 +44,16 @@ class Cell:
         Value for programs, in SI units with all digits; None if it is unknown.
     text : str
         Text for people, in the unit that the table states.
-    strong : bool
+    is_strong : bool
         Whether the text is emphasised.
-    doubtful : bool
+    is_doubtful : bool
         Whether the value is shown in grey, because the data do not support it as a result.
     """
 
     value: CellValue
     text: str
-    strong: bool = False
-    doubtful: bool = False
+    is_strong: bool = False
+    is_doubtful: bool = False
 
     @property
     def is_number(self) -> bool:
@@ -93,7 +93,7 @@ class Column:
     std_of_previous: bool = False
 
     @property
-    def numeric(self) -> bool:
+    def is_numeric(self) -> bool:
         """Whether the column contains numbers."""
         return self.number_format != TEXT_FORMAT
 
@@ -129,9 +129,9 @@ class Table:
         may lack entries.
     notes : tuple of str
         Sentences below the table.
-    selected : int or None
+    highlighted_row : int or None
         Index of the row that is shown in bold.
-    grouped : bool
+    is_grouped : bool
         Whether the terminal shows a line between rows whose first cells differ.
     """
 
@@ -140,8 +140,8 @@ class Table:
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
-    selected: int | None = None
-    grouped: bool = False
+    highlighted_row: int | None = None
+    is_grouped: bool = False
 
     @classmethod
     def from_rows(
@@ -152,8 +152,8 @@ class Table:
         rows: Iterable[Sequence[Entry]],
         notes: Sequence[str] = (),
         *,
-        selected: int | None = None,
-        grouped: bool = False,
+        highlighted_row: int | None = None,
+        is_grouped: bool = False,
     ) -> Table:
         """Return a table from rows that are sequences of entries in the order of the columns.
 
@@ -169,14 +169,16 @@ class Table:
             Entries of each row, in the order of the columns.
         notes : sequence of str, optional
             Sentences below the table.
-        selected : int, optional
+        highlighted_row : int, optional
             Index of the row that is shown in bold.
-        grouped : bool
+        is_grouped : bool
             Whether a line is drawn between rows whose first entries differ.
         """
         column_keys = [column.key for column in columns]
         keyed_rows = tuple(dict(zip(column_keys, row, strict=True)) for row in rows)
-        return cls(name, caption, tuple(columns), keyed_rows, tuple(notes), selected, grouped)
+        return cls(
+            name, caption, tuple(columns), keyed_rows, tuple(notes), highlighted_row, is_grouped
+        )
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -267,23 +269,25 @@ def terminal_table(table: Table) -> rich.table.Table:
     for column in table.shown_columns:
         if not column.std_of_previous:
             rich_table.add_column(
-                Text(column.heading), justify="right" if column.numeric else "left"
+                Text(column.heading), justify="right" if column.is_numeric else "left"
             )
     cell_rows = table.shown_rows
     for row_index, row in enumerate(cell_rows):
         row_cells: list[Text] = []
         for cell, is_std in zip(row, std_columns, strict=True):
             if not is_std:
-                row_cells.append(Text(cell.text, style="dim italic" if cell.doubtful else ""))
+                row_cells.append(Text(cell.text, style="dim italic" if cell.is_doubtful else ""))
             elif cell.value:
                 # No space follows the ±, so that a narrow terminal breaks the line before it.
                 row_cells[-1].append(f" ±{cell.text}")
         ends_group = (
-            table.grouped
+            table.is_grouped
             and row[0].text != cell_rows[min(row_index + 1, len(cell_rows) - 1)][0].text
         )
         rich_table.add_row(
-            *row_cells, end_section=ends_group, style="bold" if row_index == table.selected else ""
+            *row_cells,
+            end_section=ends_group,
+            style="bold" if row_index == table.highlighted_row else "",
         )
     return rich_table
 
@@ -355,7 +359,7 @@ def latex_table(table: Table) -> str:
     The notes follow below the table.
     """
     columns = table.shown_columns
-    column_alignment = "".join("r" if column.numeric else "l" for column in columns)
+    column_alignment = "".join("r" if column.is_numeric else "l" for column in columns)
     latex_lines = [
         r"\begin{table}",
         r"  \centering",
@@ -468,7 +472,7 @@ def mark_cell(cell: Cell) -> Cell:
 
 def grey_cell(cell: Cell) -> Cell:
     """Return a cell in grey, for example the standard deviation of a number with the symbol †."""
-    return replace(cell, doubtful=cell.value is not None)
+    return replace(cell, is_doubtful=cell.value is not None)
 
 
 def flagged_cells(cells: Sequence[Cell], flag: str | None) -> tuple[Cell, ...]:

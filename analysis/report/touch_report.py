@@ -63,7 +63,7 @@ def touches_table(session_touches: Sequence[SessionTouches]) -> Table:
         ("± or to: 95 % interval; the angle is that of the motor at the touch.",)
         if table_rows
         else (),
-        grouped=has_several_sessions,
+        is_grouped=has_several_sessions,
     )
 
 

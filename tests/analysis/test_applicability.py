@@ -11,9 +11,9 @@ import pytest
 
 from analysis import fit
 from analysis.applicability import (
+    analysis_remarks,
     check_excited_band,
     record_band_hz,
-    remarks,
     welch_analysis,
     welch_exclusion_reason,
     welch_settings,
@@ -52,7 +52,9 @@ def test_the_band_ends_at_four_tenths_of_the_rate(record_of, every, last_hz):
     record = record_of(every)
     assert record_band_hz(record) == (0.0, last_hz)
     assert welch_settings(record, WelchSettings()).band_hz == (0.5875, last_hz)
-    assert [f"{last_hz:g} Hz" in each for each in remarks(record)] == [True] * (last_hz < 50)
+    assert [f"{last_hz:g} Hz" in each for each in analysis_remarks(record)] == [True] * (
+        last_hz < 50
+    )
     # And that is what the estimator takes: 0.4 of the rate, and nothing beyond.
     measurement = Measurement.from_record(record)
     assert (
@@ -70,7 +72,7 @@ def test_band_of_a_part_is_its_sweep(record_of):
         assert record_band_hz(part) == record_hz
         assert welch_settings(part, WelchSettings()).band_hz == welch_hz
         assert record_band_hz(part, (2.0, 30.0)) == (2.0, 30.0)
-        (remark,) = remarks(part)
+        (remark,) = analysis_remarks(part)
         assert f"{record_hz[0]:g} to {record_hz[1]:g} Hz" in remark
         assert welch_exclusion_reason(part) is None
 
@@ -79,7 +81,7 @@ def test_requested_band_applies_to_all_fits(record_of):
     record = record_of()
     assert record_band_hz(record, (2.0, 30.0)) == (2.0, 30.0)
     assert welch_settings(record, WelchSettings(), (2.0, 30.0)).band_hz == (2.0, 30.0)
-    assert remarks(record, (2.0, 30.0)) == ()
+    assert analysis_remarks(record, (2.0, 30.0)) == ()
     # A frequency response is undefined at 0 Hz: its next bin is the first.
     assert welch_settings(record, WelchSettings(), (0.0, 30.0)).band_hz == (1 / 160, 30.0)
     own = WelchSettings(band_hz=(1.0, 60.0))
@@ -144,9 +146,9 @@ def test_suggested_option_makes_the_fits(record_of):
 
 
 def test_remark_that_fits_assume_a_free_beam(record_of):
-    (remark,) = remarks(record_of(excitation="touch"))
+    (remark,) = analysis_remarks(record_of(excitation="touch"))
     assert "analyze touch estimates where" in remark
-    assert remarks(record_of(excitation="chirp")) == ()
+    assert analysis_remarks(record_of(excitation="chirp")) == ()
 
 
 def test_stopped_sweep_is_fitted_up_to_its_end(record_of):

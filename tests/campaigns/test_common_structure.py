@@ -61,7 +61,7 @@ def test_another_beam_is_still_distinguished(sessions, campaign_of):
         moved.append(replace(session, record_estimates=estimates))
     found = campaign_of(moved).homogeneity
     assert found.is_mixture
-    assert sorted(map(len, found.leading_scatter.groups)) == [20, 20]
+    assert sorted(map(len, found.leading_scatter.session_groups)) == [20, 20]
 
 
 def test_structure_missing_from_some_sessions_is_not_compared(sessions, make_session, campaign_of):

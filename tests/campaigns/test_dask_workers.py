@@ -48,7 +48,7 @@ def test_campaign_agrees_with_a_local_one(cluster, short_sessions, settings, mon
     """From another folder than the workers', by relative paths."""
     monkeypatch.chdir(short_sessions[0].parent)
     paths = [Path(path.name) for path in short_sessions[:2]]
-    there = campaign(paths, settings, structures=(), dask=cluster.scheduler_address)
+    there = campaign(paths, settings, structures=(), dask_address=cluster.scheduler_address)
     here = campaign(paths, settings, structures=(), jobs=1)
     assert [each.path for each in there.sessions] == short_sessions[:2]
     for one, two in zip(there.statistics, here.statistics, strict=True):

@@ -47,7 +47,7 @@ def test_scatter_by_hand(of_frequencies):
     assert frequency.relative_between_session_std == pytest.approx(math.sqrt(97 / 3))
     assert frequency.between_session_std == pytest.approx(0.01 * math.sqrt(97 / 3))
     assert frequency.i_squared == pytest.approx(0.97)
-    assert frequency.groups == (("0.mcap", "2.mcap"), ("1.mcap", "3.mcap"))
+    assert frequency.session_groups == (("0.mcap", "2.mcap"), ("1.mcap", "3.mcap"))
     assert found.is_mixture
     assert not found.is_mixed("damping_ratio_1")  # the same of all
     assert not found.scatter_of("damping_ratio_1").is_mixture
@@ -80,7 +80,7 @@ def test_one_different_session_of_twenty_is_reported(of_frequencies):
     values[7] = 2.62
     found = of_frequencies(values, 0.01)
     assert found.leading_scatter.i_squared < 0.9
-    assert found.leading_scatter.groups[1] == ("7.mcap",)
+    assert found.leading_scatter.session_groups[1] == ("7.mcap",)
     assert "1 file (7.mcap)" in specimen_sentences.describe_specimens(found)[1]
 
 
@@ -106,7 +106,7 @@ def test_many_standard_deviations_may_be_a_slight_change(of_frequencies, distanc
 def test_groups_are_reported_only_with_clear_gaps(of_frequencies, values, parts):
     found = of_frequencies(2.5 + 1e-3 * np.array(values), 1e-3)
     names = tuple(tuple(f"{number}.mcap" for number in part) for part in parts)
-    assert found.scatter_of("frequency_hz_1").groups == names
+    assert found.scatter_of("frequency_hz_1").session_groups == names
 
 
 def test_files_of_one_name_in_two_folders_are_distinct(make_session, make_estimate, campaign_of):
@@ -128,7 +128,7 @@ def test_files_are_grouped_by_stated_specimen(make_session, make_experiment, cam
     torn = SessionFailure(Path("torn"), "torn is incomplete.")
     found = campaign_of([*results[:2], torn, results[2]]).homogeneity
     first, second = found.specimens
-    assert (first.files, second.files) == (("a", "c"), ("b",))
+    assert (first.file_names, second.file_names) == (("a", "c"), ("b",))
     (sentences,) = specimen_sentences.describe_specimens(found)
     assert (
         "2 different specimens: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 "
@@ -182,10 +182,10 @@ def test_distance_of_groups_is_that_of_their_frequencies(mixture, truth):
     (first_rad_s,) = undamped_frequencies_rad_s(link, 1)
     distance_hz = first_rad_s / (2 * np.pi) * (math.sqrt(STIFFER) - 1)
     frequency = mixture.homogeneity.scatter_of("frequency_hz_1")
-    values = {name: value for name, value, _ in frequency.values}
-    soft, stiff = (np.mean([values[name] for name in part]) for part in frequency.groups)
+    values = {name: value for name, value, _ in frequency.session_estimates}
+    soft, stiff = (np.mean([values[name] for name in part]) for part in frequency.session_groups)
     # The difference of two means of two: as uncertain as one session.
-    own_hz = math.sqrt(np.mean([std**2 for _, _, std in frequency.values]))
+    own_hz = math.sqrt(np.mean([std**2 for _, _, std in frequency.session_estimates]))
     assert stiff - soft == pytest.approx(distance_hz, abs=3 * own_hz)
     # Of two equal groups at a distance d the variance of four is d²/3, nearly all between sessions.
     assert frequency.between_session_std == pytest.approx((stiff - soft) / math.sqrt(3), rel=0.01)

@@ -51,7 +51,7 @@ def test_bias_is_the_difference_of_means(make_sessions, biases_of):
     freest, (found,) = biases_of(make_sessions(0.068, 0.001))
     by_name = {each.parameter: each for each in found.parameters}
     bias = by_name["lambda"]
-    assert bias.welch == pytest.approx(1.068)
+    assert bias.welch_mean == pytest.approx(1.068)
     assert bias.bias == pytest.approx(0.068)
     assert bias.welch_std == pytest.approx(0.001 * np.std([-1, -0.5, 0, 0.5, 1], ddof=1))
     assert bias.bias_std == pytest.approx(np.hypot(bias.welch_std, RECORD_STD) / 5**0.5)

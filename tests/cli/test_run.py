@@ -20,7 +20,7 @@ from processes import child_running, eventually, has_ended, ignored, ignores
 from resting_beams import pressing_force_n
 
 from analysis import load, select
-from analysis.applicability import remarks, welch_exclusion_reason, welch_settings
+from analysis.applicability import analysis_remarks, welch_exclusion_reason, welch_settings
 from analysis.models import WelchSettings
 from analysis.paper import estimate
 from analysis.record import record_of
@@ -562,9 +562,9 @@ def test_chirp_there_and_back_begins_as_a_plain_chirp(short_chirps, tmp_path):
     settings = welch_settings(both, WelchSettings())
     responses = [estimate(record, settings)[0].response for record in (both, plain)]
     np.testing.assert_array_equal(*responses)
-    assert any("use the first sweep alone" in remark for remark in remarks(both))
+    assert any("use the first sweep alone" in remark for remark in analysis_remarks(both))
     assert welch_exclusion_reason(both) is None
-    assert not remarks(plain)
+    assert not analysis_remarks(plain)
     # The reference passes the same angles, and the frequency at equal distances from the turn.
     reference = both.reference_rad - both.reference_rad[0]
     assert np.abs(np.diff(reference[20_400:20_600])).max() < 0.025 * 2 * np.pi * 50 / 1000
@@ -582,7 +582,7 @@ def test_welch_estimate_there_and_back_uses_the_way_there(short_chirps):
     settings = welch_settings(both, WelchSettings(segment_length=1439, overlap=216))
     responses = [estimate(record, settings)[0].response for record in (both, plain)]
     np.testing.assert_array_equal(*responses)
-    assert any("use the first sweep alone" in remark for remark in remarks(both))
+    assert any("use the first sweep alone" in remark for remark in analysis_remarks(both))
     assert welch_exclusion_reason(both) is None
 
 

@@ -528,7 +528,7 @@ def test_options_of_one_record_hold_in_a_campaign(monkeypatch, files):
     fixed, formats, uniformity = [], [], []
 
     def run(_files, options, *_):
-        fixed.append(options.fixed)
+        fixed.append(options.fixed_parameters)
         formats.append(options.figures)
         uniformity.append(options.uniformity)
         return 0

@@ -95,7 +95,7 @@ def test_all_types_are_defined_and_the_selected_marked(record_result):
     assert (rows["I"]["internal"], rows["I"]["external"]) == ("ζ s", "–")
     assert (rows["VI"]["internal"], rows["VI"]["external"]) == ("ζ s^α", "γ s^λ")
     assert rows["VII"]["damping"] == "internal of integer order, external of fractional order"
-    assert table.rows[table.selected]["type"] == "VI"
+    assert table.rows[table.highlighted_row]["type"] == "VI"
 
 
 def test_the_page_shows_the_equations(report, record_result):

@@ -51,7 +51,7 @@ def whole_record(record, *_):  # as does the search of a structure
     return replace(pickle.loads(Path(sys.argv[3]).read_bytes()), record=record)
 analysis.results.whole_record = whole_record
 settings = WelchSettings(types=("I",), weightings=("const",), estimator="fft", band_hz=(1.0, 20.0))
-options = AnalysisOptions(settings, with_welch_fits=True, whole_record=True, fixed=())
+options = AnalysisOptions(settings, with_welch_fits=True, whole_record=True, fixed_parameters=())
 with redirect_stdout(sys.stderr):
     assert session_command([Path(sys.argv[1])], options, OutputOptions(Path(sys.argv[2]))) == 0
 print(*sys.modules)

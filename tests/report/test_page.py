@@ -217,7 +217,9 @@ def test_csv_and_page_hold_the_same_numbers(report, read_page, record_result):
         header, *rows = csv.reader(open_table(report, table.name))
         of_validity = ["predicted_peak_tip_slope_rad", "linear_model_error"]
         assert header == [*(column.key for column in table.columns), *of_validity]
-        numeric = [i for i, column in enumerate(table.columns) if column.numeric and column.heading]
+        numeric = [
+            i for i, column in enumerate(table.columns) if column.is_numeric and column.heading
+        ]
         in_csv = [[float(row[i]) for i in numeric if row[i]] for row in rows]
         assert any(in_csv)
         assert in_csv == read_page.rows[table.name][1:]
@@ -274,7 +276,7 @@ def test_unsupported_orders_are_not_reported(record_result, with_selection):
     assert "its order α is not known" in content
     assert reason in content
     (row,) = [row for row in tables[1].shown_rows if row[0].text == "α"]
-    assert all(cell.doubtful and cell.value is not None for cell in row[3:7])
+    assert all(cell.is_doubtful and cell.value is not None for cell in row[3:7])
     assert 'href="#paper"' not in text
 
 
@@ -301,7 +303,7 @@ def test_unexplained_residual_makes_numbers_conditional(record_result, with_sele
     for table in (modes, tables[0], tables[1]):
         for row in table.shown_rows:
             shown = [cell for cell in row if cell.is_number]
-            assert sum(cell.doubtful for cell in shown) >= len(shown) - 1
+            assert sum(cell.is_doubtful for cell in shown) >= len(shown) - 1
 
 
 def test_simpler_structure_is_shown_with_the_freest(record_result, with_selection):

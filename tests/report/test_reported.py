@@ -62,7 +62,7 @@ def test_tables_mark_flagged_numbers_only(careful):
     shown = {row["parameter"].text: row for row in parameters.rows}
     for symbol, name in (("ζ", "zeta"), ("α", "alpha")):
         number = shown[symbol]["value"]
-        assert (number.value, number.doubtful) == (careful.whole.fit.parameters[name], True)
+        assert (number.value, number.is_doubtful) == (careful.whole.fit.parameters[name], True)
         assert NOT_REPORTED_MARK in number.text
         assert shown[symbol]["remark"] == REASON
     assert [shown["α"][end].value for end in ("low_95", "high_95")] == [0.9, 1.2]
@@ -74,7 +74,7 @@ def test_tables_mark_flagged_numbers_only(careful):
             cells = {key: cell for key, cell in row.items() if isinstance(cell, Cell)}
             assert cells.keys() >= {*unsupported, "gamma", "lambda"}
             for key, cell in cells.items():
-                assert cell.doubtful == (key in unsupported and cell.value is not None)
+                assert cell.is_doubtful == (key in unsupported and cell.value is not None)
         assert any(
             NOT_REPORTED_MARK in note and "α" in note and "λ" not in note for note in table.notes
         )
@@ -115,7 +115,7 @@ def test_mark_is_at_the_flagged_number_of_a_mode(
     table, _, _ = report_tables(result)
     marked = [cell.text.endswith(NOT_REPORTED_MARK) for cell in table.shown_rows[0]]
     assert [index for index, is_marked in enumerate(marked) if is_marked] == [column]
-    assert not any(cell.doubtful for row in table.shown_rows[1:] for cell in row)
+    assert not any(cell.is_doubtful for row in table.shown_rows[1:] for cell in row)
     assert table.notes[-1] == f"{NOT_REPORTED_MARK} {REASON}."
     assert [row["remark"] for row in rows_of(table)] == [f"{quantity}: {REASON}", "", ""]
     source = latex_table(table)
@@ -152,7 +152,7 @@ def test_free_number_of_a_condition_has_its_flag(careful, with_selection):
         is_flagged = row["parameter"].value in ("alpha", "zeta")
         assert row["remark"] == (REASON if is_flagged else "")
         assert row["free_value"].text.endswith(NOT_REPORTED_MARK) == is_flagged
-        assert not row["value"].doubtful
+        assert not row["value"].is_doubtful
 
 
 def test_order_of_absent_damping_is_not_determined(record_result, with_selection):
@@ -180,7 +180,7 @@ def test_supported_numbers_are_not_marked(record_result):
     modes, tables, of_paper = report_tables(record_result)
     for table in (modes, *tables, *of_paper):
         assert NOT_REPORTED_MARK not in csv_text(table) + "".join(table.notes)
-        assert not any(cell.doubtful for row in table.shown_rows for cell in row)
+        assert not any(cell.is_doubtful for row in table.shown_rows for cell in row)
 
 
 def test_page_terminal_and_text_tables_show_the_mark(careful, as_text):

@@ -93,7 +93,7 @@ def test_fixed_parameter_has_no_combined_interval(stated):
     held = replace(
         whole,
         selection=replace(whole.selection, headline=headline),
-        fixed=("bending_stiffness_n_m2",),
+        fixed_parameters=("bending_stiffness_n_m2",),
     )
     assert held.parameters_with_scales == {}
     assert "the file's values of EI, which were held" in notes_of(held)

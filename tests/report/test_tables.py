@@ -178,6 +178,6 @@ def test_table_is_shown_in_its_units_and_written_in_full(as_text):
 
 def test_groups_of_rows_are_separated(as_text):
     columns = (Column("type", "type", TEXT_FORMAT), Column("n", "n"))
-    table = Table.from_rows("name", "", columns, [("I", 1), ("I", 2), ("II", 3)], grouped=True)
+    table = Table.from_rows("name", "", columns, [("I", 1), ("I", 2), ("II", 3)], is_grouped=True)
     lines = [line.strip() for line in as_text(terminal_table(table)).splitlines()]
     assert [line.split() for line in lines[2:]] == [["I", "1"], ["I", "2"], [], ["II", "3"]]

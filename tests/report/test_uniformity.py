@@ -167,7 +167,7 @@ def test_unexplained_losses_are_points_without_a_curve(unexplained_losses):
     assert content["records"][0]["curves"]["loss_factor"] is None
     assert uniformity_tables(unexplained_losses.whole)[1:] == ()
     tables = {each.name: each for each in report_tables(unexplained_losses)[1]}
-    assert all(row["remark"] for row in tables["parameters"].rows if row["value"].doubtful)
+    assert all(row["remark"] for row in tables["parameters"].rows if row["value"].is_doubtful)
 
 
 def test_no_curve_of_losses_with_an_order_fitted_to_frequencies(modal_result, with_selection):
