@@ -219,9 +219,9 @@ def descend(
     )
     damping, damping_growth = _INITIAL_STEP_DAMPING, 2.0
     while evaluation_count < max_evaluations:
-        is_unknown_held = current_equations.is_held_at_bound(x, region.lower, region.upper)
-        is_unknown_free = ~is_unknown_held & (current_equations.hessian.diagonal() > 0)
-        if not is_unknown_free.any():
+        is_held_unknown = current_equations.is_held_at_bound(x, region.lower, region.upper)
+        is_free_unknown = ~is_held_unknown & (current_equations.hessian.diagonal() > 0)
+        if not is_free_unknown.any():
             break
         if (
             early_stop_limits is not None
@@ -236,12 +236,12 @@ def descend(
             else current_equations.hessian
         )
         step = _compute_step(
-            model_hessian, current_equations, is_unknown_free, damping, step_limits
+            model_hessian, current_equations, is_free_unknown, damping, step_limits
         )
         if step is None:  # not convex
             has_second_part, model_hessian = False, current_equations.hessian
             step = _compute_step(
-                model_hessian, current_equations, is_unknown_free, damping, step_limits
+                model_hessian, current_equations, is_free_unknown, damping, step_limits
             )
         if step is None:
             break
@@ -285,7 +285,7 @@ def descend(
 def _compute_step(
     model_hessian: NDArray[np.float64],
     current_equations: NormalEquations,
-    is_unknown_free: NDArray[np.bool_],
+    is_free_unknown: NDArray[np.bool_],
     damping: float,
     step_limits: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64] | None:
@@ -295,14 +295,14 @@ def _compute_step(
     Return None if the model is not convex.
     """
     smallest_step, largest_step = step_limits
-    step = np.zeros(is_unknown_free.size)
+    step = np.zeros(is_free_unknown.size)
     curvatures = current_equations.hessian.diagonal()
     damped_hessian = model_hessian.copy()
     damped_hessian.flat[:: step.size + 1] += damping * np.maximum(
-        curvatures, _SMALLEST_RELATIVE_CURVATURE * curvatures[is_unknown_free].max()
+        curvatures, _SMALLEST_RELATIVE_CURVATURE * curvatures[is_free_unknown].max()
     )
     gradient = current_equations.gradient
-    free_indices = np.flatnonzero(is_unknown_free)
+    free_indices = np.flatnonzero(is_free_unknown)
     while free_indices.size:
         hessian_block = damped_hessian[free_indices[:, None], free_indices]
         try:

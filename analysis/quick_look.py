@@ -251,14 +251,14 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     undelayed_response = estimate.response.without_delays(
         input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
     )
-    is_shown = (
+    is_shown_bin = (
         estimate.excited
         & (undelayed_response.frequency_hz >= FIRST_HZ)
         & np.isfinite(undelayed_response.response)
     )
     shown_frequency_hz, shown_response = (
-        undelayed_response.frequency_hz[is_shown],
-        undelayed_response.response[is_shown],
+        undelayed_response.frequency_hz[is_shown_bin],
+        undelayed_response.response[is_shown_bin],
     )
     selected_bins = response_decimation(shown_frequency_hz).extremes(np.abs(shown_response))
     response_document = {
@@ -267,12 +267,12 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
         "phase_rad": _round_digits(np.angle(shown_response[selected_bins])),
         "coherence": None
         if coherence_values is None
-        else _round_digits(coherence_values[is_shown][selected_bins]),
+        else _round_digits(coherence_values[is_shown_bin][selected_bins]),
         "resolution_hz": round(resolution_hz, 4),
     }
     if coherence_values is None or shown_frequency_hz.size == 0:
         return response_document, _empty_coherence(), []
-    shown_coherence = coherence_values[is_shown]
+    shown_coherence = coherence_values[is_shown_bin]
     incoherent_bands = _join_bins(
         shown_frequency_hz,
         shown_coherence < LOW_COHERENCE,
@@ -322,16 +322,16 @@ def _estimate_coherence(
             record.first_sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
         )
         segmentation = replace(segmentation, segment_length=segment_length, overlap=overlap_samples)
-        shorter_estimate = _estimate_response(record, segmentation, last_hz)
+        short_segment_estimate = _estimate_response(record, segmentation, last_hz)
         return (
-            None if shorter_estimate is None else shorter_estimate.response.coherence,
+            None if short_segment_estimate is None else short_segment_estimate.response.coherence,
             segmentation,
         )
     return estimate.response.coherence, segmentation
 
 
 def _join_bins(
-    frequency_hz: RealArray, is_selected: NDArray[np.bool_], resolution_hz: float
+    frequency_hz: RealArray, is_selected_bin: NDArray[np.bool_], resolution_hz: float
 ) -> Iterator[tuple[float, float]]:
     """Yield the frequency bands, as first and last frequency in Hz, that the selected bins form.
 
@@ -340,7 +340,7 @@ def _join_bins(
     """
     import numpy as np
 
-    selected_hz = frequency_hz[is_selected]
+    selected_hz = frequency_hz[is_selected_bin]
     band_start_indices = (
         np.flatnonzero(
             np.diff(selected_hz)

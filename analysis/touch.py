@@ -279,26 +279,31 @@ class TouchAnalysis:
         record_around_touch = touch_record(
             touch_samples, detection_tick, rate_hz, shear_coefficients
         )
-        time_s = record_around_touch.detected / rate_hz
+        touch_time_s = record_around_touch.detected / rate_hz
         recorded_after_s = (
             record_around_touch.angle_rad.size - 1 - record_around_touch.detected
         ) / rate_hz
         angles_rad = record_around_touch.angle_rad
-        if time_s < _MIN_RECORD_BEFORE_TOUCH_S or recorded_after_s < _MIN_RECORD_AFTER_TOUCH_S:
+        if (
+            touch_time_s < _MIN_RECORD_BEFORE_TOUCH_S
+            or recorded_after_s < _MIN_RECORD_AFTER_TOUCH_S
+        ):
             return Touch(
                 touch_number,
                 detection_tick,
-                time_s,
+                touch_time_s,
                 float(angles_rad[record_around_touch.detected]),
                 start_s,
             )
         prepared_model = self._prepare_model(touch_model, rate_hz)
         touch_estimate = prepared_model.estimator.estimate(record_around_touch)
         if touch_estimate.time_s is not None:
-            time_s = touch_estimate.time_s.value
-        angle_rad = float(np.interp(time_s, np.arange(angles_rad.size) / rate_hz, angles_rad))
+            touch_time_s = touch_estimate.time_s.value
+        angle_rad = float(np.interp(touch_time_s, np.arange(angles_rad.size) / rate_hz, angles_rad))
         x_m = prepared_model.free_beam.x_m
-        deflection_m = _free_deflection_m(prepared_model.free_beam, record_around_touch, time_s)
+        deflection_m = _free_deflection_m(
+            prepared_model.free_beam, record_around_touch, touch_time_s
+        )
         contact_point_m = interval_ends_m = None
         if touch_estimate.x_m is not None:
             positions_m = np.array([touch_estimate.x_m.value, *touch_estimate.x_m.interval_95])
@@ -560,20 +565,24 @@ def _number_list(numbers: Sequence[int]) -> str:
 # Seen from above
 
 
-def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, time_s: float) -> RealArray:
+def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, touch_time_s: float) -> RealArray:
     """Return the deflection in metres of a beam that moves freely, relative to its undeformed line.
 
     `free_beam` computes the motion at points along the beam, the first at the motor's axis. Its
-    vibration is fitted to the samples of `record` before `time_s` (since the record's start).
+    vibration is fitted to the samples of `record` before `touch_time_s` (since the record's start).
     """
-    fit_sample_count = min(max(int(time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detected)
+    fit_sample_count = min(
+        max(int(touch_time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detected
+    )
     free_motion = free_beam.motion(record, fit_sample_count, fit_sample_count - 4)
-    step_index = round((time_s - free_motion.first_s) / free_motion.step_s)
+    step_index = round((touch_time_s - free_motion.first_s) / free_motion.step_s)
     displacement_m: RealArray = free_motion.displacement_m[
         :, min(max(step_index, 0), free_motion.displacement_m.shape[1] - 1)
     ]
     times_s = np.arange(record.angle_rad.size) / record.rate_hz
-    return displacement_m - float(np.interp(time_s, times_s, record.angle_rad)) * free_beam.x_m
+    return (
+        displacement_m - float(np.interp(touch_time_s, times_s, record.angle_rad)) * free_beam.x_m
+    )
 
 
 def _top_view(angle_rad: float, along_m: RealArray, across_m: RealArray) -> RealArray:

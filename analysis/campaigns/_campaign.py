@@ -320,14 +320,14 @@ def _separate_experiments(
         for session_result in session_results
         if isinstance(session_result, SessionAnalysis)
     ]
-    common_session = usable_sessions[
+    reference_session = usable_sessions[
         most_common_index([session.experiment for session in usable_sessions])
     ]
     stated_experiments = [
         session_result.experiment for session_result in session_results if session_result.experiment
     ]
     agreeing_experiment_count = sum(
-        common_session.experiment.difference(experiment) is None
+        reference_session.experiment.difference(experiment) is None
         for experiment in stated_experiments
     )
     majority_text = (
@@ -336,7 +336,7 @@ def _separate_experiments(
     sessions: list[SessionAnalysis] = []
     failures: list[SessionFailure] = []
     for session_result in session_results:
-        reason = _exclusion_reason(session_result, common_session, majority_text, sessions)
+        reason = _exclusion_reason(session_result, reference_session, majority_text, sessions)
         if reason is None and isinstance(session_result, SessionAnalysis):
             sessions.append(session_result)
         elif reason is None and isinstance(session_result, SessionFailure):
@@ -407,21 +407,21 @@ def _add_missing_facts(
 
 def _exclusion_reason(
     session_result: SessionAnalysis | SessionFailure,
-    common_session: SessionAnalysis,
+    reference_session: SessionAnalysis,
     majority_text: str,
     accepted_sessions: Sequence[SessionAnalysis],
 ) -> str | None:
     """Return why a session does not belong to the campaign, or None if it does.
 
-    `common_session` is a session of the most common experiment, `accepted_sessions` are the
+    `reference_session` is a session of the most common experiment, `accepted_sessions` are the
     sessions accepted so far. The reason contains `majority_text`, which says so if most sessions
-    agree with `common_session`.
+    agree with `reference_session`.
     """
     experiment = session_result.experiment
-    difference = experiment and common_session.experiment.difference(experiment)
+    difference = experiment and reference_session.experiment.difference(experiment)
     if difference:
         return (
-            f"{difference} in {common_session.path}{majority_text}; a campaign repeats one "
+            f"{difference} in {reference_session.path}{majority_text}; a campaign repeats one "
             "experiment on one specimen: analyse this one by itself, or correct the metadata."
         )
     if isinstance(session_result, SessionFailure):
@@ -434,21 +434,21 @@ def _exclusion_reason(
             == other_session.experiment.session_identifiers
         ):
             return f"it is the same session as {other_session.path}, which would count twice."
-        if session_result.digests & other_session.digests:
+        if session_result.sample_digests & other_session.sample_digests:
             return (
                 f"it has samples of {other_session.path}, noise included, which would count twice: "
                 "a copy or a part of that file, or a simulation with the same seed; analyse this "
                 "one by itself."
             )
-    both_have_welch_fits = common_session.frequency_hz.size and session_result.frequency_hz.size
+    both_have_welch_fits = reference_session.frequency_hz.size and session_result.frequency_hz.size
     if both_have_welch_fits and not np.array_equal(
-        common_session.frequency_hz, session_result.frequency_hz
+        reference_session.frequency_hz, session_result.frequency_hz
     ):
         return (
             f"its estimate has {len(session_result.frequency_hz)} bins from "
-            f"{session_result.frequency_hz[0]:g} Hz, but that of {common_session.path} "
-            f"{len(common_session.frequency_hz)} from "
-            f"{common_session.frequency_hz[0]:g} Hz, so they cannot be averaged: their rates "
+            f"{session_result.frequency_hz[0]:g} Hz, but that of {reference_session.path} "
+            f"{len(reference_session.frequency_hz)} from "
+            f"{reference_session.frequency_hz[0]:g} Hz, so they cannot be averaged: their rates "
             "differ; analyse this one by itself, or leave --segment and --nfft to the defaults."
         )
     return None

@@ -82,12 +82,14 @@ def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
     if pooled_estimate is None or verdict is None:
         return None
     pooled_orders = (verdict.alpha, verdict.lambda_)
-    exact_orders, common_flag = _exact_orders(verdict), _common_flag(verdict)
+    exact_orders, flag_of_all_values = _exact_orders(verdict), _flag_of_all_values(verdict)
     exact_estimates = Estimates(
         name=pooled_estimate.name,
-        parameters=_reported_parameters(campaign, pooled_estimate, exact_orders, common_flag),
-        sizes=_reported_loss_factors(pooled_estimate, exact_orders, common_flag),
-        modes=_reported_modes(campaign, pooled_estimate, common_flag),
+        parameters=_reported_parameters(
+            campaign, pooled_estimate, exact_orders, flag_of_all_values
+        ),
+        sizes=_reported_loss_factors(pooled_estimate, exact_orders, flag_of_all_values),
+        modes=_reported_modes(campaign, pooled_estimate, flag_of_all_values),
         structures=tuple(
             (structure.name, _structure_status(structure, pooled_estimate))
             for structure in campaign.structures
@@ -102,8 +104,8 @@ def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
         modal_model,
         modal_model.uniform_beam,
         modal_model.tolerant,
-        common_flag,
-        common_flag,
+        flag_of_all_values,
+        flag_of_all_values,
         half_width=modal_model.half_width_in_stds,
     )
     return _add_flags(reported_estimates, campaign, pooled_orders)
@@ -124,7 +126,7 @@ def pooled_flags(campaign: CampaignResult, pooled_estimate: PooledEstimate) -> d
         return {}
     refusal_reason = uniform_beam_refusal_reason(modal_model.uniform_beam) if modal_model else None
     reported_parameters = _reported_parameters(
-        campaign, pooled_estimate, _exact_orders(verdict), _common_flag(verdict)
+        campaign, pooled_estimate, _exact_orders(verdict), _flag_of_all_values(verdict)
     )
     return {
         parameter_name: flag
@@ -138,7 +140,7 @@ def _exact_orders(verdict: CampaignVerdict) -> tuple[PooledOrder, ...]:
     return tuple(order.exact or order for order in (verdict.alpha, verdict.lambda_))
 
 
-def _common_flag(verdict: CampaignVerdict) -> str | None:
+def _flag_of_all_values(verdict: CampaignVerdict) -> str | None:
     """Return the flag of all estimates, or None if the residual of enough sessions is noise."""
     are_records_explained = verdict.adequate >= _MIN_ADEQUATE_FRACTION * verdict.sessions
     return None if are_records_explained else _UNEXPLAINED_FLAG
@@ -206,7 +208,7 @@ def _reported_parameters(
     campaign: CampaignResult,
     pooled_estimate: PooledEstimate,
     orders: tuple[PooledOrder, ...],
-    common_flag: str | None,
+    flag_of_all_values: str | None,
 ) -> dict[str, Estimate]:
     """Return the pooled parameters with their flags."""
     is_mixed = campaign.homogeneity.is_mixed
@@ -216,7 +218,7 @@ def _reported_parameters(
             parameter.value,
             parameter.std,
             parameter.interval,
-            common_flag
+            flag_of_all_values
             or (_MIXTURE_FLAG if is_mixed(parameter.name) else order_flags.get(parameter.name)),
         )
         for parameter in pooled_estimate.parameters
@@ -227,7 +229,7 @@ def _reported_parameters(
             parameter_name not in DAMPING_PARAMETERS or parameter_name in free_parameter_names
         ):
             reported_parameters[parameter_name] = Estimate(
-                fixed_value, None, None, common_flag or _ON_BOUND_FLAG
+                fixed_value, None, None, flag_of_all_values or _ON_BOUND_FLAG
             )
     return reported_parameters
 
@@ -243,18 +245,18 @@ def _order_flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
 
 
 def _reported_loss_factors(
-    pooled_estimate: PooledEstimate, orders: tuple[PooledOrder, ...], common_flag: str | None
+    pooled_estimate: PooledEstimate, orders: tuple[PooledOrder, ...], flag_of_all_values: str | None
 ) -> tuple[ReportedLossFactor, ...]:
     """Return the loss factors with their flags."""
     order_flags = _order_flags(orders)
     return tuple(
-        loss_factor.with_flag(common_flag or order_flags.get(loss_factor.order))
+        loss_factor.with_flag(flag_of_all_values or order_flags.get(loss_factor.order))
         for loss_factor in pooled_estimate.sizes
     )
 
 
 def _reported_modes(
-    campaign: CampaignResult, pooled_estimate: PooledEstimate, common_flag: str | None
+    campaign: CampaignResult, pooled_estimate: PooledEstimate, flag_of_all_values: str | None
 ) -> tuple[ReportedMode, ...]:
     """Return frequency and damping ratio of each pooled mode, with their flags."""
     t, is_mixed = (
@@ -264,7 +266,7 @@ def _reported_modes(
 
     def reported_value(value: float, std: float, quantity: str) -> Estimate:
         """Return a quantity of a mode with its interval and flag."""
-        value_flag = common_flag or (_MIXTURE_FLAG if is_mixed(quantity) else None)
+        value_flag = flag_of_all_values or (_MIXTURE_FLAG if is_mixed(quantity) else None)
         return Estimate(value, std, (value - t * std, value + t * std), value_flag)
 
     return tuple(

@@ -133,7 +133,7 @@ def pooled_order(
     )
 
 
-def tolerant_pooled_order(
+def pooled_order_with_tolerance(
     exact_order: PooledOrder,
     estimate: TolerantEstimate,
     verdicts: Sequence[Verdict],

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rigd.beam import Beam, Plant
 
 
-_INVALIDATING_FINDINGS: Final = ("sign", "unit")
+_INVALIDATING_FINDING_KINDS: Final = ("sign", "unit")
 """Kinds of findings (wrong sign or unit of a channel) that invalidate all results of a session."""
 
 _NO_RESPONSE: Final = FrequencyResponse(
@@ -82,7 +82,7 @@ class SessionAnalysis:
         Frequency band of the whole-record fits.
     name : str
         Name in tables and sentences (see `distinct_names`); the name of the file by default.
-    digests : frozenset of bytes
+    sample_digests : frozenset of bytes
         Digests of the session's samples (see `rigd.session.sample_digests`).
     validity : Validity
         Validity of the linear model for the session.
@@ -111,7 +111,7 @@ class SessionAnalysis:
     segments: int = 0
     record_band_hz: tuple[float, float] = RECORD_BAND_HZ
     name: str = ""
-    digests: frozenset[bytes] = frozenset()
+    sample_digests: frozenset[bytes] = frozenset()
     validity: Validity = field(default_factory=Validity)
     modal: ModalEstimate | None = None
     nominal: Plant | None = None
@@ -222,7 +222,8 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
             warnings = (*warnings, f"Not in the whole-record estimate: {path}: {failure_reason}")
     findings = record_result.verdict.findings if record_result else ()
     if invalidating_findings := next(
-        (finding.sentence for finding in findings if finding.kind in _INVALIDATING_FINDINGS), None
+        (finding.sentence for finding in findings if finding.kind in _INVALIDATING_FINDING_KINDS),
+        None,
     ):
         return SessionFailure(path, f"{path}: {invalidating_findings}", experiment)
     return _session_result(
@@ -275,7 +276,7 @@ def _session_result(
         settings=used_settings,
         segments=measured_response.segments,
         record_band_hz=record_band_hz(record, session_task.band_hz),
-        digests=sample_digests(record.angle_rad, record.torque_nm),
+        sample_digests=sample_digests(record.angle_rad, record.torque_nm),
         validity=record_result.validity,
         modal=None
         if modal_estimate is None or not modal_estimate.visible

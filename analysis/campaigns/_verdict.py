@@ -14,8 +14,8 @@ from analysis.campaigns._modal import OppositeSweeps, opposite_sweeps
 from analysis.campaigns._orders import (
     PooledOrder,
     pooled_order,
+    pooled_order_with_tolerance,
     rival_estimates,
-    tolerant_pooled_order,
 )
 from analysis.campaigns.pooling import freest_estimate
 from analysis.identify.headline import TILTED_AXIS_REASON
@@ -217,7 +217,7 @@ def campaign_verdict(
     lowest_bic_estimate, freest_fit = pooled[0], freest_estimate(pooled)
     assert freest_fit is not None
     alpha, lambda_ = (
-        _final_order(
+        _reported_order(
             _doubt_if_tilted(pooled_order(order, pooled, verdicts, homogeneity), sessions),
             verdicts,
             modal_model,
@@ -300,7 +300,7 @@ def _doubt_if_tilted(exact_order: PooledOrder, sessions: Sequence[SessionAnalysi
     return exact_order.with_doubt(TILTED_AXIS_REASON)
 
 
-def _final_order(
+def _reported_order(
     exact_order: PooledOrder, verdicts: Sequence[Verdict], modal_model: PooledModalModel | None
 ) -> PooledOrder:
     """Return an order estimated from the modal constants or, without them, for a uniform beam."""
@@ -308,7 +308,7 @@ def _final_order(
         return exact_order
     if modal_model.tolerant is not None:
         is_beam_refused = modal_model.uniform_beam.status == "refused"
-        return tolerant_pooled_order(
+        return pooled_order_with_tolerance(
             exact_order, modal_model.tolerant, verdicts, is_beam_refused=is_beam_refused
         )
     refusal_reason = uniform_beam_refusal_reason(modal_model.uniform_beam)

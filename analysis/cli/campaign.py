@@ -84,7 +84,7 @@ def campaign_command(
     from analysis.campaigns import campaign
     from analysis.report import campaign_document, document_text
     from analysis.report.campaign_report import campaign_tables
-    from analysis.report.folder import report_folders, write_new
+    from analysis.report.folder import report_folders, write_new_file
 
     folder_source = files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_NAME)
     (report_folder,) = report_folders([folder_source], outputs.report, overwrite=outputs.overwrite)
@@ -99,7 +99,7 @@ def campaign_command(
     if outputs.json is not None and not outputs.json_to_stdout:
         # The file is written before any output, because the streams may be closed.
         json_text = document_text(campaign_document(campaign_result, with_paper_values=with_paper))
-        write_new(outputs.json, json_text, overwrite=outputs.overwrite)
+        write_new_file(outputs.json, json_text, overwrite=outputs.overwrite)
         text_lines.insert(0, f"All results as JSON: {outputs.json}")
     console = outputs.console()
     console.print(
@@ -124,7 +124,7 @@ def _analyse_and_write(
     """Analyse a campaign and write its report, with a progress bar; print the errors."""
     from analysis.campaigns import SingleSessionError
     from analysis.report.campaign_report import write_campaign
-    from analysis.report.folder import new_folder
+    from analysis.report.folder import new_report_folder
     from rigd.printable import progress_bar
 
     with progress_bar("{task.completed:.0f}/{task.total:.0f}") as progress:
@@ -135,7 +135,7 @@ def _analyse_and_write(
                 bar, completed=done_steps, total=total_steps + _MAX_FIGURES, description=file_name
             )
 
-        with new_folder(report_folder, overwrite=outputs.overwrite) as partial_folder:
+        with new_report_folder(report_folder, overwrite=outputs.overwrite) as partial_folder:
             campaign_result = run_campaign(on_progress=on_progress)
             if len(campaign_result.sessions) == 1:
                 raise SingleSessionError(campaign_result.sessions[0].path, campaign_result.failures)

@@ -169,7 +169,7 @@ def session_command(
         An output file cannot be written.
     """
     from analysis.report import document, document_text
-    from analysis.report.folder import report_folders, write_new
+    from analysis.report.folder import report_folders, write_new_file
 
     folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
     record_results, errors, exit_code = _analyse_all(files, folders, options, rerun, outputs)
@@ -178,7 +178,7 @@ def session_command(
     results_document = document(record_results, {**(other_errors or {}), **errors})
     if outputs.json is not None and not outputs.json_to_stdout:
         # The file is written before any output, because the streams may be closed.
-        write_new(outputs.json, document_text(results_document), overwrite=outputs.overwrite)
+        write_new_file(outputs.json, document_text(results_document), overwrite=outputs.overwrite)
     console = outputs.console()
     _print_tables(console, record_results, is_single_file=len(files) == 1, verbose=outputs.verbose)
     if outputs.json_to_stdout:
@@ -339,12 +339,12 @@ def _analyse_file(
     overwrite: bool,
 ) -> RecordResult:
     """Analyse one file, and write its report and its file for Rerun."""
-    from analysis.report.folder import new_folder
+    from analysis.report.folder import new_report_folder
     from analysis.report.record_report import write_report
     from analysis.results import record_result
 
     file_result = record_result(session_file, options, on_step=on_step, warn=warn)
-    with new_folder(report_folder, overwrite=overwrite) as partial_folder:
+    with new_report_folder(report_folder, overwrite=overwrite) as partial_folder:
         write_report(file_result, partial_folder, on_step, formats=options.figures)
     if rerun_file is not None:
         from analysis.report import write_rerun_file

@@ -83,7 +83,7 @@ def touch_command(
 def _run_analysis(files: Sequence[Path], model_file: Path | None, outputs: OutputOptions) -> int:
     """Analyse the files, print and write the results, and return the exit code."""
     from analysis.report import document_text
-    from analysis.report.folder import new_folder, write_new
+    from analysis.report.folder import new_report_folder, write_new_file
     from analysis.report.table import terminal_table
     from analysis.report.touch_report import (
         session_lines,
@@ -95,9 +95,9 @@ def _run_analysis(files: Sequence[Path], model_file: Path | None, outputs: Outpu
     session_touches, error_messages = _analyse_sessions(files, model_file)
     json_document = touches_document(session_touches, error_messages)
     if outputs.json is not None and not outputs.json_to_stdout:
-        write_new(outputs.json, document_text(json_document))
+        write_new_file(outputs.json, document_text(json_document))
     if outputs.report is not None and session_touches:
-        with new_folder(outputs.report) as partial_folder:
+        with new_report_folder(outputs.report) as partial_folder:
             write_touch_report(session_touches, error_messages, partial_folder)
     console = outputs.console()
     print_plain = partial(console.print, markup=False, highlight=False, soft_wrap=True)

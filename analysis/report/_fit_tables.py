@@ -18,11 +18,11 @@ from analysis.report.table import (
     Entry,
     Table,
     estimate_cells,
-    footnotes,
     grey_cell,
     mark_cell,
     number_cell,
     unreported_parameters,
+    unsupported_order_notes,
 )
 from rigd.beam import DAMPING_PARAMETERS, PARAMETERS
 
@@ -89,7 +89,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
         ),
         table_rows,
         (
-            *footnotes(unsupported_orders),
+            *unsupported_order_notes(unsupported_orders),
             "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE of "
             "the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power over "
             "that of the noise, 1 if nothing but noise is left. Free: number of free parameters, "
@@ -264,7 +264,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
             for fit, model in zip(fits, analysis.models, strict=True)
         ),
         (
-            *footnotes(unsupported_orders),
+            *unsupported_order_notes(unsupported_orders),
             f"Fit: NRMSE of the complex response in the band. {_FIT_INDEX_UNITS_NOTE} std (±): one "
             "standard "
             "deviation, from the scatter of the response about the model. The bias of Welch's "

@@ -17,7 +17,7 @@ FactGroup = tuple[str, list[tuple[str, str]]]
 """Title of a group of facts, and the name and value of each fact."""
 
 
-def page(template_name: str, **template_content: Any) -> str:  # noqa: ANN401 - what the template asks for
+def render_page(template_name: str, **template_content: Any) -> str:  # noqa: ANN401 - what the template asks for
     """Return the HTML that a template of this package and its content give.
 
     Raise an error if the template uses a name that is not in the content.

@@ -25,9 +25,9 @@ from analysis.report.table import (
     Row,
     Table,
     estimate_cells,
-    footnotes,
     number_cell,
     unreported_parameters,
+    unsupported_order_notes,
 )
 from rigd.spectral import PAPER_RATE_HZ
 
@@ -369,7 +369,7 @@ def bias_table(campaign: CampaignResult) -> Table:
         (
             "Types whose whole-record residual is noise. Significant: other than zero at the 0.1 % "
             "level. A bias is the same in every session: it does not show in the std of Table 3.",
-            *footnotes(unsupported_orders),
+            *unsupported_order_notes(unsupported_orders),
         ),
         is_grouped=True,
     )  # fmt: skip

@@ -26,12 +26,12 @@ from analysis.report.table import (
     estimate_cells,
     flag_notes,
     flagged_cells,
-    footnotes,
     grey_cell,
     mark_cell,
     mode_flag,
     number_cell,
     unreported_parameters,
+    unsupported_order_notes,
 )
 from rigd.units import decimals
 
@@ -188,7 +188,7 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
         STRUCTURES[only_estimate.structure], unsupported_orders
     )
     if unreported_names:
-        table_notes += footnotes(unsupported_orders)
+        table_notes += unsupported_order_notes(unsupported_orders)
     flag_by_parameter = pooled_flags(campaign, only_estimate)
     table_notes += flag_notes(
         flag

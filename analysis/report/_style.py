@@ -26,7 +26,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
 from analysis.models import STRUCTURES
-from analysis.report.folder import write_new
+from analysis.report.folder import write_new_file
 from analysis.results import DEFAULT_FORMATS, FIGURE_FORMATS
 from rigd.beam import parameter_named
 from rigd.runtime.computations import computed_in_parallel
@@ -209,7 +209,7 @@ def save_figure(figure: Figure, path: Path) -> bytes:
         format_name for format_name in FIGURE_FORMATS if path.suffix == f".{format_name}"
     )
     figure_bytes = render_figure(figure, file_format)
-    write_new(path, figure_bytes)
+    write_new_file(path, figure_bytes)
     return figure_bytes
 
 
@@ -275,7 +275,9 @@ def save_pictures(
         rendered_images = images[illustration.name]
         for file_format in formats:
             # The suffix is appended, because a name may contain dots.
-            write_new(folder / f"{illustration.name}.{file_format}", rendered_images[file_format])
+            write_new_file(
+                folder / f"{illustration.name}.{file_format}", rendered_images[file_format]
+            )
         has_small_svg = "svg" in rendered_images and len(rendered_images["svg"]) <= _MAX_SVG_BYTES
         page_format: FigureFormat = "svg" if has_small_svg else "png"
         pictures.append(

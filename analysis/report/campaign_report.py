@@ -19,7 +19,7 @@ from analysis.report._document import document_text
 from analysis.report._paper_tables import paper_tables, welch_method_text
 from analysis.report._shared_warnings import FileWarnings, shared_warnings
 from analysis.report._text import as_text, warning_lines, with_empty_lines
-from analysis.report.folder import write_new
+from analysis.report.folder import write_new_file
 from analysis.report.table import csv_text
 from analysis.results import DEFAULT_FORMATS
 
@@ -154,11 +154,11 @@ def campaign_page(
     str
         HTML document that refers to no other files.
     """
-    from analysis.report._page import page, version_facts
+    from analysis.report._page import render_page, version_facts
 
     session_paths = [session.path for session in campaign.sessions]
     all_sentences = campaign_sentences(campaign)
-    return page(
+    return render_page(
         "campaign.html",
         title=f"Campaign of {len(session_paths)} sessions",
         files=f"{session_paths[0].name} to {session_paths[-1].name}, "
@@ -296,13 +296,15 @@ def write_campaign(
     for table_name, report_table in all_tables(
         campaign, with_paper_values=with_paper_values
     ).items():
-        write_new(folder / "tables" / f"{table_name}.csv", csv_text(report_table))
+        write_new_file(folder / "tables" / f"{table_name}.csv", csv_text(report_table))
     document_json = document_text(campaign_document(campaign, with_paper_values=with_paper_values))
-    write_new(folder / "campaign.json", document_json)
-    write_new(folder / "tables.txt", campaign_text(campaign, with_paper_values=with_paper_values))
+    write_new_file(folder / "campaign.json", document_json)
+    write_new_file(
+        folder / "tables.txt", campaign_text(campaign, with_paper_values=with_paper_values)
+    )
     made_at = datetime.now().astimezone()
     page_html = campaign_page(campaign, pictures, made_at, with_paper_values=with_paper_values)
-    write_new(folder / "report.html", page_html)
+    write_new_file(folder / "report.html", page_html)
 
 
 def _illustrations(campaign: CampaignResult) -> Iterator[Illustration]:

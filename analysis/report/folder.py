@@ -91,7 +91,7 @@ def report_folders(
         for requested_folder in requested_folders
     ]
     for folder in folders:
-        _require_free_or_report(folder)
+        _require_replaceable_folder(folder)
     return folders
 
 
@@ -153,7 +153,7 @@ def _contains_results(path: Path) -> bool:
 
 
 @contextmanager
-def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
+def new_report_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """Provide a temporary folder that is renamed on success and removed on failure.
 
     Parameters
@@ -207,7 +207,7 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
         shutil.rmtree(temporary_folder, ignore_errors=True)
 
 
-def write_new(path: Path, file_content: str | bytes, *, overwrite: bool = False) -> None:
+def write_new_file(path: Path, file_content: str | bytes, *, overwrite: bool = False) -> None:
     """Write a new file, and create the folders of its path. Text is encoded as UTF-8.
 
     Parameters
@@ -252,7 +252,7 @@ def _replace_file(path: Path, file_bytes: bytes) -> None:
 # Earlier reports
 
 
-def _require_free_or_report(folder: Path) -> None:
+def _require_replaceable_folder(folder: Path) -> None:
     """Raise OutputExistsError unless a folder is absent, empty or contains an earlier report."""
     if not _is_missing_or_empty(folder) and not (
         folder.is_dir() and (folder / CHECKSUM_LIST_NAME).is_file()
@@ -306,9 +306,11 @@ def _is_unchanged_report_file(
 ) -> bool:
     """Return whether a file in a report's folder is listed there and has a listed checksum."""
     file_path = folder / file_name
-    is_inside = file_path.resolve().is_relative_to(folder.resolve()) and not file_path.is_symlink()
+    is_inside_folder = (
+        file_path.resolve().is_relative_to(folder.resolve()) and not file_path.is_symlink()
+    )
     return (
-        is_inside
+        is_inside_folder
         and file_path.is_file()
         and sha256(file_path) in listed_checksums.get(file_name, ())
     )

@@ -14,7 +14,7 @@ from analysis.report._document import document, document_text
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
 from analysis.report._text import damping_sentences, tables_text
 from analysis.report._uniformity import UNIFORMITY_FIGURE, uniformity_table
-from analysis.report.folder import sha256, write_new
+from analysis.report.folder import sha256, write_new_file
 from analysis.report.table import Table, csv_text, latex_table, with_validity
 from analysis.results import DEFAULT_FORMATS
 from rigd.spectral import WINDOW
@@ -65,13 +65,13 @@ def record_page(
     str
         HTML document that refers to no other files.
     """
-    from analysis.report._page import page, version_facts
+    from analysis.report._page import render_page, version_facts
 
     whole_record = result.whole
     assert whole_record is not None
     other_pictures = [picture for picture in pictures if picture.name != UNIFORMITY_FIGURE]
     uniformity_test = whole_record.headline.uniform_beam
-    return page(
+    return render_page(
         "record.html",
         title=result.name,
         session=_session_lines(result.record),
@@ -278,15 +278,17 @@ def _write_page(
         *paper_tables,
     ):
         result_table = with_validity(report_table, result.validity)
-        write_new(folder / "tables" / f"{result_table.name}.csv", csv_text(result_table))
+        write_new_file(folder / "tables" / f"{result_table.name}.csv", csv_text(result_table))
         if result_table.name in _LATEX_TABLES:
-            write_new(folder / "tables" / f"{result_table.name}.tex", latex_table(result_table))
-    write_new(folder / "tables" / "model.tex", latex(equations(whole_record)))
+            write_new_file(
+                folder / "tables" / f"{result_table.name}.tex", latex_table(result_table)
+            )
+    write_new_file(folder / "tables" / "model.tex", latex(equations(whole_record)))
     made_at = datetime.now().astimezone()
     page_html = record_page(
         result, pictures, mode_table, record_tables, made_at, paper_pictures, paper_tables
     )
-    write_new(folder / "report.html", page_html)
+    write_new_file(folder / "report.html", page_html)
 
 
 def uniformity_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
@@ -376,7 +378,7 @@ def write_report(
 
         illustrations = [*paper_illustrations, *record_illustrations(whole_record)]
     pictures = save_pictures(illustrations, folder / "figures", formats, on_step)
-    write_new(folder / "tables.txt", tables_text(result))
+    write_new_file(folder / "tables.txt", tables_text(result))
     if whole_record is not None:
         paper_figure_count = len(paper_illustrations)
         _write_page(
@@ -386,7 +388,7 @@ def write_report(
             pictures[paper_figure_count:],
             pictures[:paper_figure_count],
         )
-    write_new(folder / "analysis.json", document_text(document([result])))
+    write_new_file(folder / "analysis.json", document_text(document([result])))
 
 
 def welch_figure_names(*, with_paper_figures: bool, has_whole_record: bool) -> tuple[str, ...]:

@@ -525,7 +525,7 @@ def mode_flag(mode: ReportedMode) -> str | None:
     )
 
 
-def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
+def unsupported_order_notes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
     """Return the note on the symbol † as a tuple; empty if all orders are supported."""
     if not unsupported_orders:
         return ()

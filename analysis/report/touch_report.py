@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from analysis.report._document import document_text, program_versions
-from analysis.report.folder import write_new
+from analysis.report.folder import write_new_file
 from analysis.report.table import TEXT_FORMAT, Cell, Column, Entry, Table, csv_text, number_cell
 from analysis.results import finite_json
 from rigd.units import decimals, with_half_width
@@ -221,11 +221,11 @@ def write_touch_report(
 
     pictures = save_pictures(list(touch_illustrations(session_touches)), folder / "figures")
     touch_table = touches_table(session_touches)
-    write_new(folder / "tables" / "touches.csv", csv_text(touch_table))
-    write_new(
+    write_new_file(folder / "tables" / "touches.csv", csv_text(touch_table))
+    write_new_file(
         folder / "touches.json", document_text(touches_document(session_touches, error_messages))
     )
-    page_html = pages.page(
+    page_html = pages.render_page(
         "touch.html",
         title=session_touches[0].path.stem
         if len(session_touches) == 1
@@ -248,7 +248,7 @@ def write_touch_report(
         paper_tables=(),
         how=[*_collect_facts(session_touches), pages.version_facts(datetime.now().astimezone())],
     )
-    write_new(folder / "report.html", page_html)
+    write_new_file(folder / "report.html", page_html)
 
 
 def _collect_facts(session_touches: Sequence[SessionTouches]) -> list[FactGroup]:

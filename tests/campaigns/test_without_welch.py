@@ -25,7 +25,7 @@ def found(make_file, tmp_path_factory, campaign_of):
     first = analyse_session(path, SessionTask(WelchSettings(types=("I",)), ("III",), (), None))
     experiment = replace(first.experiment, identity=("1.mcap",))
     other = replace(
-        first, path=path.with_name("1.mcap"), experiment=experiment, digests=frozenset()
+        first, path=path.with_name("1.mcap"), experiment=experiment, sample_digests=frozenset()
     )
     return campaign_of([first, other], structures=("III",))
 

@@ -9,9 +9,9 @@ from analysis.report.folder import (
     OutputError,
     OutputExistsError,
     check_new_file,
-    new_folder,
+    new_report_folder,
     report_folders,
-    write_new,
+    write_new_file,
 )
 
 
@@ -36,7 +36,7 @@ def test_only_an_empty_folder_is_used(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     assert report_folders([tmp_path / "a.mcap"], out) == [out]
-    with new_folder(out) as part:
+    with new_report_folder(out) as part:
         (part / "x").write_text("1")
     assert (out / "x").read_text() == "1"
     with pytest.raises(OutputExistsError, match="out"):
@@ -44,7 +44,7 @@ def test_only_an_empty_folder_is_used(tmp_path):
 
 
 def test_a_folder_is_complete_or_absent(tmp_path):
-    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "out") as part:
+    with pytest.raises(KeyboardInterrupt), new_report_folder(tmp_path / "out") as part:
         (part / "x").write_text("1")
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
@@ -52,7 +52,7 @@ def test_a_folder_is_complete_or_absent(tmp_path):
 
 def test_folder_that_appears_meanwhile_is_preserved(tmp_path):
     out = tmp_path / "out"
-    with pytest.raises(OutputExistsError, match="meanwhile"), new_folder(out) as part:
+    with pytest.raises(OutputExistsError, match="meanwhile"), new_report_folder(out) as part:
         (part / "x").write_text("mine")
         out.mkdir()
         (out / "x").write_text("theirs")
@@ -62,27 +62,27 @@ def test_folder_that_appears_meanwhile_is_preserved(tmp_path):
 
 def test_impossible_folder_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file"), new_folder(tmp_path / "file" / "out"):
+    with pytest.raises(OutputError, match="file"), new_report_folder(tmp_path / "file" / "out"):
         pass
 
 
 def test_new_file_must_not_exist(tmp_path):
     path = tmp_path / "deep" / "a.json"
     check_new_file(path, "--json")
-    write_new(path, "1")
+    write_new_file(path, "1")
     with pytest.raises(OutputExistsError, match="--json"):
         check_new_file(path, "--json")
     with pytest.raises(OutputExistsError):
-        write_new(path, "2")
+        write_new_file(path, "2")
     assert path.read_text() == "1"
     with pytest.raises(OutputError, match="written"):
-        write_new(path / "below.json", "3")
+        write_new_file(path / "below.json", "3")
 
 
 def write_report(folder, overwrite=True, **files):
-    with new_folder(folder, overwrite=overwrite) as part:
+    with new_report_folder(folder, overwrite=overwrite) as part:
         for name, text in files.items():
-            write_new(part / name.replace("_in_", "/"), text)
+            write_new_file(part / name.replace("_in_", "/"), text)
 
 
 def contents(folder):
@@ -180,10 +180,10 @@ def test_non_report_folder_is_not_replaced(tmp_path):
 
 def test_only_earlier_results_are_replaced(tmp_path):
     path = tmp_path / "a.json"
-    write_new(path, '{"versions": {}, "headlines": [], "fits": []}', overwrite=True)
-    write_new(path, '{"versions": {}, "headlines": [], "fits": [1]}', overwrite=True)
+    write_new_file(path, '{"versions": {}, "headlines": [], "fits": []}', overwrite=True)
+    write_new_file(path, '{"versions": {}, "headlines": [], "fits": [1]}', overwrite=True)
     with pytest.raises(OutputExistsError, match="nothing is overwritten"):
-        write_new(path, "2")
+        write_new_file(path, "2")
     assert "[1]" in path.read_text()
     for text in ('{"fits": []}', "[]", "not JSON"):
         path.write_text(text)

@@ -9,7 +9,7 @@ from analysis.models import WelchSettings
 from analysis.paper.welch_analysis import analyse
 from analysis.record import RecordError, load_record
 from analysis.report import document_text
-from analysis.report.folder import write_new
+from analysis.report.folder import write_new_file
 
 ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega")
 
@@ -76,5 +76,5 @@ def test_record_too_short_for_any_mode_names_all_causes(write_session, short_sig
 
 def test_file_name_with_invalid_text_is_accepted(tmp_path):
     name = "caf\udce9.mcap"
-    write_new(tmp_path / "a.json", document_text({"file": name}))
+    write_new_file(tmp_path / "a.json", document_text({"file": name}))
     assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {"file": name}
