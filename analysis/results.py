@@ -339,8 +339,8 @@ def record_result(
     path: Path,
     options: AnalysisOptions,
     *,
-    on_step: Callable[[str], None] = lambda _done: None,
-    warn: Callable[[str], None] = lambda _text: None,
+    on_step: Callable[[str], None] = lambda _step_text: None,
+    warn: Callable[[str], None] = lambda _warning_text: None,
 ) -> RecordResult:
     """Run the selected analyses of a session file.
 

@@ -260,7 +260,7 @@ def save_pictures(
     illustrations: Sequence[Illustration],
     folder: Path,
     formats: Collection[FigureFormat] = DEFAULT_FORMATS,
-    on_step: Callable[[str], None] = lambda _done: None,
+    on_step: Callable[[str], None] = lambda _step_text: None,
 ) -> list[Picture]:
     """Draw figures, write each in several formats, and return them for a page.
 

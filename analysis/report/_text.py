@@ -104,7 +104,7 @@ def _main_results(whole_record: WholeRecord) -> RenderableType:
     shown_columns = tuple(
         table_column
         for table_column in parameter_table.columns
-        if table_column.key != omitted_column
+        if table_column.column_key != omitted_column
     )
     short_table = replace(parameter_table, columns=shown_columns, rows=tuple(shown_rows))
     mode_table = tables.modes_table(whole_record)

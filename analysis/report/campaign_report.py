@@ -264,7 +264,7 @@ def write_campaign(
     *,
     with_paper_values: bool = False,
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
-    on_step: Callable[[str], None] = lambda _done: None,
+    on_step: Callable[[str], None] = lambda _step_text: None,
 ) -> None:
     """Write the report of a campaign into a folder.
 

@@ -339,7 +339,7 @@ The whole-record fits have their own figures of signals and torque."""
 def write_report(
     result: RecordResult,
     folder: Path,
-    on_step: Callable[[str], None] = lambda _done: None,
+    on_step: Callable[[str], None] = lambda _step_text: None,
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
 ) -> None:
     """Write the report of a record into a folder.

@@ -75,7 +75,7 @@ class Column:
     ----------
     heading : str
         Heading for people. A column with an empty heading is written to files only.
-    key : str
+    column_key : str
         Name for programs, with the SI unit: header in CSV, key in JSON.
     number_format : str
         Format of the column's numbers; `TEXT_FORMAT` if the column contains texts.
@@ -87,7 +87,7 @@ class Column:
     """
 
     heading: str
-    key: str
+    column_key: str
     number_format: str = ".4g"
     display_factor: float = 1.0
     std_of_previous: bool = False
@@ -174,7 +174,7 @@ class Table:
         is_grouped : bool
             Whether a line is drawn between rows whose first entries differ.
         """
-        column_keys = [column.key for column in columns]
+        column_keys = [column.column_key for column in columns]
         keyed_rows = tuple(dict(zip(column_keys, row, strict=True)) for row in rows)
         return cls(
             name, caption, tuple(columns), keyed_rows, tuple(notes), highlighted_row, is_grouped
@@ -185,7 +185,7 @@ class Table:
         """Keys of all entries in the order of the rows: the header of the table's CSV file."""
         return tuple(
             dict.fromkeys(key for row in self.rows for key in row)
-            or (column.key for column in self.columns)
+            or (column.column_key for column in self.columns)
         )
 
     @property
@@ -195,7 +195,7 @@ class Table:
         return tuple(
             column
             for column in self.columns
-            if column.heading and (column.key in keys_with_entries or not self.rows)
+            if column.heading and (column.column_key in keys_with_entries or not self.rows)
         )
 
     @property
@@ -203,7 +203,7 @@ class Table:
         """Cells of a table's displayed columns, row by row."""
         columns = self.shown_columns
         return tuple(
-            tuple(column.displayed_cell(row.get(column.key, "")) for column in columns)
+            tuple(column.displayed_cell(row.get(column.column_key, "")) for column in columns)
             for row in self.rows
         )
 

@@ -395,7 +395,7 @@ def test_added_metadata_are_in_the_table_of_sessions(done):
     added = {"temperature_c": 21.5, "batch": "B 7"}
     warm = replace(first, experiment=replace(first.experiment, added_metadata=added))
     table = session_list_table(replace(found, sessions=(warm, *others)))
-    headings = {column.key: column.heading for column in table.columns}
+    headings = {column.column_key: column.heading for column in table.columns}
     assert headings["meta_temperature_c"] == "temperature (°C)"
     assert headings["meta_batch"] == "batch"
     one, two, *_ = json_rows(table)

@@ -216,7 +216,7 @@ def test_csv_and_page_hold_the_same_numbers(report, read_page, record_result):
     for table in (modes, *tables, *of_paper):
         header, *rows = csv.reader(open_table(report, table.name))
         of_validity = ["predicted_peak_tip_slope_rad", "linear_model_error"]
-        assert header == [*(column.key for column in table.columns), *of_validity]
+        assert header == [*(column.column_key for column in table.columns), *of_validity]
         numeric = [
             i for i, column in enumerate(table.columns) if column.is_numeric and column.heading
         ]
