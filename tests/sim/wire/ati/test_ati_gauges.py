@@ -67,7 +67,7 @@ def test_the_stated_quantisation_is_nearly_reached(gauges):
 
 def test_another_range_uses_the_gauges_as_well(gauges, make_can_host):
     small = make_can_host(sensor=replace(SENSOR, range=tuple(0.1 * RANGE))).node.gauges
-    counts = small.read([tuple(0.1 * RANGE)])
+    counts = small.read_counts([tuple(0.1 * RANGE)])
     assert np.abs(counts - gauges.read_counts([tuple(RANGE)])).max() <= 1
 
 
