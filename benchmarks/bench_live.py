@@ -19,7 +19,7 @@ from gate import Gate, Row
 from loop_rounds import in_turn, lateness_ratio, show
 
 from rigd.bench import _loops as loops
-from rigd.bench.measure import LoopMeasurement, record_measurement
+from rigd.bench.measure import LoopMeasurement, measurement_from_samples
 from rigd.engine.shared_state import Phase
 from rigd.engine.workers import LIVE
 from rigd.excitation import make_excitation
@@ -94,7 +94,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
     text, percent = "", 0.0
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
-        loops.connected_rig(profile, live=live) as (rig, group),
+        loops.connected_rig(profile, with_live_view=live) as (rig, group),
     ):
         order = SessionOrder(profile, excitation, Path(folder) / "bench.mcap")
         meters, stop = [], StopRequest()
@@ -120,7 +120,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
         if result.outcome != "complete" or result.path is None:
             raise SystemExit(f"The session was not completed: {result.reason}")
         samples = read_session(result.path).samples
-    found = record_measurement(
+    found = measurement_from_samples(
         WITH if live else WITHOUT,
         RATE_HZ,
         samples,

@@ -17,11 +17,11 @@ import statistics
 from gate import Gate, Row
 from loop_rounds import Round, lateness_ratio, show
 
-from rigd.bench import HIGHEST_HZ, cores_without_loop, loop_core
+from rigd.bench import HIGHEST_LOOP_RATE_HZ, cores_without_loop, loop_core
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
-from rigd.bench.measure import HELD_FRACTION, percentiles
-from rigd.checks.machine import settings_granted
+from rigd.bench.measure import MIN_HELD_FRACTION, percentiles
+from rigd.checks.machine import granted_realtime_settings
 from rigd.profile import load_profile
 from rigd.runtime.background import use_one_thread
 
@@ -56,14 +56,14 @@ def one_round(seconds: float, granted: dict[str, str]) -> Round:
     plain = loops.simulated_profile(profile, RATE_HZ, 0.0)
     spinning = loops.simulated_profile(profile, RATE_HZ, SPIN_US)
     found = {
-        PEER: cyclictest.run(
-            RATE_HZ, seconds, cpu=loop_core(granted), priority=profile.realtime.priority
+        PEER: cyclictest.run_cyclictest(
+            RATE_HZ, seconds, core_number=loop_core(granted), priority=profile.realtime.priority
         ),
-        IDLE: loops.run_alone(IDLE, plain, seconds, quiet),
-        SPUN: loops.run_alone(SPUN, spinning, seconds, quiet),
+        IDLE: loops.run_without_recorder(IDLE, plain, seconds, quiet),
+        SPUN: loops.run_without_recorder(SPUN, spinning, seconds, quiet),
     }
     with loops.busy_program(cores_without_loop(granted)):
-        found[LOADED] = loops.run_session(LOADED, plain, seconds, quiet, live=True)
+        found[LOADED] = loops.run_session(LOADED, plain, seconds, quiet, with_live_view=True)
     return found
 
 
@@ -75,12 +75,12 @@ def highest_rate(seconds: float) -> float:
     profile = load_profile("sim")
     rate_hz = RATE_HZ
     highest_hz = {"all ticks": 0.0, "but for stalls": 0.0}
-    while rate_hz <= HIGHEST_HZ:
+    while rate_hz <= HIGHEST_LOOP_RATE_HZ:
         rig = loops.simulated_profile(profile, rate_hz, 0.0)
         tries = [loops.run_session("session", rig, seconds, quiet) for _ in range(TRIES)]
-        held = max(one.held for one in tries)
-        between = max(one.held_between_stalls for one in tries)
-        best = max(tries, key=lambda one: one.held_between_stalls)
+        held = max(one.held_fraction for one in tries)
+        between = max(one.held_fraction_between_stalls for one in tries)
+        best = max(tries, key=lambda one: one.held_fraction_between_stalls)
         late, work = percentiles(best.lateness_us), percentiles(best.work_us)
         print(
             f"  {rate_hz:6.0f} Hz held {100 * held:7.3f} %, but for stalls {100 * between:7.3f} %  "
@@ -89,10 +89,10 @@ def highest_rate(seconds: float) -> float:
             flush=True,
         )
         for what, fraction in (("all ticks", held), ("but for stalls", between)):
-            if fraction >= HELD_FRACTION:
+            if fraction >= MIN_HELD_FRACTION:
                 highest_hz[what] = rate_hz
         rate_hz *= 2.0
-    print(f"highest rate that holds {100 * HELD_FRACTION:g} %: {highest_hz}")
+    print(f"highest rate that holds {100 * MIN_HELD_FRACTION:g} %: {highest_hz}")
     return highest_hz["but for stalls"]
 
 
@@ -103,7 +103,7 @@ def main() -> None:
     parser.add_argument("rounds", type=int, nargs="?", default=2)
     gate = Gate(ROWS, parser)
     use_one_thread()
-    granted = settings_granted(load_profile("sim").realtime)
+    granted = granted_realtime_settings(load_profile("sim").realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
     if not cyclictest.is_installed():
         raise SystemExit("cyclictest is not installed (package rt-tests).")

@@ -30,7 +30,7 @@ from rigd_netft.settings import NetFtSettings
 from rigd.bench import _loops as loops
 from rigd.bench import cores_without_loop
 from rigd.bench.measure import LoopMeasurement
-from rigd.checks.machine import settings_granted
+from rigd.checks.machine import granted_realtime_settings
 from rigd.profile import Profile, load_profile
 from rigd.runtime.background import use_one_thread
 
@@ -132,7 +132,7 @@ def main() -> None:
     parser.add_argument("rounds", type=int, nargs="?", default=4)
     gate = Gate(ROWS, parser)
     use_one_thread()
-    granted = settings_granted(load_profile("sim").realtime)
+    granted = granted_realtime_settings(load_profile("sim").realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
     cores, rounds = cores_without_loop(granted), []
     names = (ALONE, STREAMING, READ, SIMULATED)

@@ -22,9 +22,9 @@ from rigd.bench import _loops as loops
 from rigd.bench.measure import (
     LoopMeasurement,
     UsageMeter,
-    record_measurement,
+    measurement_from_samples,
 )
-from rigd.checks.machine import settings_granted
+from rigd.checks.machine import granted_realtime_settings
 from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile
 from rigd.runner._touch_search import touch_search
@@ -78,7 +78,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
         meter = UsageMeter(group.control.pid)
 
         def watch(progress: SessionProgress, _: object) -> None:
-            meter.sample(progress.phase)
+            meter.sample_usage(progress.phase)
 
         order = SessionOrder(
             profile,
@@ -92,7 +92,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
         samples = read_session(result.path).samples
     if np.any(samples["status"] & int(Status.TOUCHED)):
         raise SystemExit("A touch was detected where there was none: the motions differ.")
-    return record_measurement(
+    return measurement_from_samples(
         name,
         RATE_HZ,
         samples,
@@ -110,7 +110,7 @@ def main() -> None:
     gate = Gate(ROWS, parser)
     use_one_thread()
     profile = loops.simulated_profile(load_profile("sim"), RATE_HZ, 0.0)
-    granted = settings_granted(profile.realtime)
+    granted = granted_realtime_settings(profile.realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
     searching = search(profile, gate.given.passes)
     motions = {WITHOUT: without_detector(searching), WITH: searching}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.bench.measure import LoopMeasurement, UsageMeter, record_measurement
+from rigd.bench.measure import LoopMeasurement, UsageMeter, measurement_from_samples
 from rigd.devices import unknown_values
 from rigd.devices.parameters import DeviceSelection
 from rigd.engine.messages import SessionFinished, SessionJob
@@ -30,16 +30,16 @@ from rigd.session.layout import decode_samples
 
 _POLL_TIMEOUT_S = 0.1
 """Longest wait in seconds for a message of the control process."""
-OVERHEAD_S = 3.5
+MEASUREMENT_OVERHEAD_S = 3.5
 """Duration of a measurement in seconds in addition to its record."""
-_BLOCK_RECORDS = 10_000
+_MAX_RECORDS_PER_READ = 10_000
 """Largest number of records that are read at once."""
 _SHORT_TARE_S = 0.2
 """Duration in seconds of the tare, and of the return, in a measured session."""
-_NO_LIMIT = 1_000_000_000
+_UNREACHABLE_TICK_COUNT = 1_000_000_000
 """Number of ticks that no session reaches, for limits that shall have no effect."""
 
-OnPoll = Callable[[], None]
+PollCallback = Callable[[], None]
 """Type of a function that is called about ten times a second during a measurement."""
 
 
@@ -73,10 +73,10 @@ def simulated_profile(profile: Profile, rate_hz: float, spin_us: float) -> Profi
         ),
         limits=replace(
             profile.limits,
-            missed_ticks_in_a_row=_NO_LIMIT,
+            missed_ticks_in_a_row=_UNREACHABLE_TICK_COUNT,
             missed_percent=100.0,
             stale_percent=100.0,
-            saturated_ticks_in_a_row=_NO_LIMIT,
+            saturated_ticks_in_a_row=_UNREACHABLE_TICK_COUNT,
             tare_drift_nm=inf,
         ),
         session=replace(
@@ -92,10 +92,12 @@ def simulated_profile(profile: Profile, rate_hz: float, spin_us: float) -> Profi
 
 
 @contextmanager
-def connected_rig(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, ProcessGroup]]:
+def connected_rig(
+    profile: Profile, *, with_live_view: bool = False
+) -> Iterator[tuple[Rig, ProcessGroup]]:
     """Start and connect the processes of a rig; they end when the context is left."""
     try:
-        with ProcessGroup(live=live) as process_group, ExitStack() as connection:
+        with ProcessGroup(live=with_live_view) as process_group, ExitStack() as connection:
             rig = Rig(profile, group=process_group)
             rig.connect()
             # This also releases the priority and cores of the supervisor, which the next
@@ -106,14 +108,14 @@ def connected_rig(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig
         raise LoopError(str(error)) from error
 
 
-def run_alone(
-    measurement_name: str, profile: Profile, seconds: float, on_poll: OnPoll
+def run_without_recorder(
+    measurement_name: str, profile: Profile, record_duration_s: float, on_poll: PollCallback
 ) -> LoopMeasurement:
     """Measure the loop without a recorder, or raise LoopError.
 
     This process only reads the samples from the ring buffer.
     """
-    rate_hz, excitation = profile.rig.rate_hz, _hold_excitation(profile, seconds)
+    rate_hz, excitation = profile.rig.rate_hz, _hold_excitation(profile, record_duration_s)
     with connected_rig(profile) as (_, process_group):
         channels, shared_state = process_group.channels, process_group.channels.shared_state
         usage_meter = UsageMeter(process_group.control.pid)
@@ -126,14 +128,14 @@ def run_alone(
         while not isinstance(finished_message, SessionFinished):
             finished_message = process_group.control.poll(_POLL_TIMEOUT_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-            usage_meter.sample(Phase(shared_state[StateField.PHASE]))
-            while sample_block := channels.samples.take(_BLOCK_RECORDS):
+            usage_meter.sample_usage(Phase(shared_state[StateField.PHASE]))
+            while sample_block := channels.samples.take(_MAX_RECORDS_PER_READ):
                 sample_blocks.append(sample_block)
             channels.controls.discard_records()
             channels.timings.discard_records()
             on_poll()
-    _require_complete(finished_message.outcome, finished_message.reason)
-    return record_measurement(
+    _require_complete_session(finished_message.outcome, finished_message.reason)
+    return measurement_from_samples(
         measurement_name,
         rate_hz,
         np.concatenate([decode_samples(sample_block) for sample_block in sample_blocks]),
@@ -144,32 +146,37 @@ def run_alone(
 
 
 def run_session(
-    measurement_name: str, profile: Profile, seconds: float, on_poll: OnPoll, *, live: bool = False
+    measurement_name: str,
+    profile: Profile,
+    record_duration_s: float,
+    on_poll: PollCallback,
+    *,
+    with_live_view: bool = False,
 ) -> LoopMeasurement:
     """Measure a complete session like that of ``rigd run``, or raise LoopError.
 
     The session file is temporary.
     """
-    excitation = _hold_excitation(profile, seconds)
+    excitation = _hold_excitation(profile, record_duration_s)
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as temporary_folder,
-        connected_rig(profile, live=live) as (rig, process_group),
+        connected_rig(profile, with_live_view=with_live_view) as (rig, process_group),
     ):
         session_order = SessionOrder(profile, excitation, Path(temporary_folder) / "bench.mcap")
         usage_meter = UsageMeter(process_group.control.pid)
         stop_request = StopRequest()
-        if live:
+        if with_live_view:
             rig.show(session_order, stop_request)
 
         def on_progress(progress: SessionProgress, _: object) -> None:
-            usage_meter.sample(progress.phase)
+            usage_meter.sample_usage(progress.phase)
             on_poll()
 
         session_result = rig.run(session_order, stop_request, on_progress)
-        _require_complete(session_result.outcome, session_result.reason)
+        _require_complete_session(session_result.outcome, session_result.reason)
         assert session_result.path is not None
         samples = read_session(session_result.path).samples
-    return record_measurement(
+    return measurement_from_samples(
         measurement_name,
         profile.rig.rate_hz,
         samples,
@@ -190,12 +197,12 @@ def busy_program(cores: set[int]) -> Iterator[int]:
             busy_process.kill()
 
 
-def _hold_excitation(profile: Profile, seconds: float) -> Excitation:
+def _hold_excitation(profile: Profile, hold_duration_s: float) -> Excitation:
     """Return an excitation whose reference angle is constant for some seconds."""
-    return hold(rate_hz=profile.rig.rate_hz, duration_s=seconds, rest_s=0.0)
+    return hold(rate_hz=profile.rig.rate_hz, duration_s=hold_duration_s, rest_s=0.0)
 
 
-def _require_complete(outcome: str, reason: str) -> None:
+def _require_complete_session(outcome: str, reason: str) -> None:
     """Raise LoopError unless the session is complete."""
     if outcome != "complete":
         raise LoopError(reason)

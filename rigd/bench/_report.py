@@ -7,15 +7,15 @@ from math import log10
 import numpy as np
 import numpy.typing as npt
 
-from rigd.bench._program import Results
-from rigd.bench.measure import HELD_FRACTION, STALL_US, LoopMeasurement, percentiles
+from rigd.bench._program import BenchResults
+from rigd.bench.measure import MIN_HELD_FRACTION, MIN_STALL_US, LoopMeasurement, percentiles
 from rigd.engine.realtime import REFUSED_PREFIX
 
-_NAME_WIDTH = 28
+_NAME_COLUMN_WIDTH = 28
 """Width of the column with the measurements' names, in characters."""
 
 
-def report_lines(results: Results) -> Iterator[str]:
+def report_lines(results: BenchResults) -> Iterator[str]:
     """Yield the lines of the report on all measurements.
 
     Parameters
@@ -32,14 +32,15 @@ def report_lines(results: Results) -> Iterator[str]:
         f", the last {results.spin_us:g} µs of each wait busy-polled" if results.spin_us else ""
     )
     yield (
-        f"The control loop at {results.rate_hz:g} Hz, everything simulated, {results.seconds:g} s "
+        f"The control loop at {results.rate_hz:g} Hz, everything simulated, "
+        f"{results.measurement_duration_s:g} s "
         f"each{spin_text}."
     )
     yield (
         "Real time: "
         + ", ".join(
             f"{setting_name.replace('_', ' ')} {setting_text}"
-            for setting_name, setting_text in results.granted.items()
+            for setting_name, setting_text in results.granted_settings.items()
         )
         + "."
     )
@@ -47,7 +48,7 @@ def report_lines(results: Results) -> Iterator[str]:
     yield ""
     yield from _latency_table(_measurements(results))
     yield ""
-    yield from _peer_lines(results)
+    yield from _cyclictest_lines(results)
     yield ""
     yield "Wake-up latency:"
     histogram_columns = [
@@ -57,12 +58,12 @@ def report_lines(results: Results) -> Iterator[str]:
     yield from histogram_lines(histogram_columns)
     yield ""
     yield "Rates, with recorder:"
-    yield from _search_table(results.search)
+    yield from _rate_table(results.search_measurements)
     yield ""
     yield verdict(results)
 
 
-def verdict(results: Results) -> str:
+def verdict(results: BenchResults) -> str:
     """Return sentences on the rate that this computer held, and on what limits it.
 
     With real devices it is lower, because a tick then waits for their replies.
@@ -71,131 +72,141 @@ def verdict(results: Results) -> str:
         results.highest_rate_hz,
         results.highest_rate_between_stalls_hz,
     )
-    criterion_text = f"{100 * HELD_FRACTION:g} % of the ticks or more"
+    criterion_text = f"{100 * MIN_HELD_FRACTION:g} % of the ticks or more"
     if highest_hz is not None:
         verdict_text = f"Simulated devices: this computer held {highest_hz:g} Hz, {criterion_text}."
     else:
-        best_measurement = max(results.search, key=lambda measurement: measurement.held)
+        best_measurement = max(
+            results.search_measurements, key=lambda measurement: measurement.held_fraction
+        )
         verdict_text = (
             "Simulated devices: this computer held none of these rates. "
             f"{best_measurement.rate_hz:g} Hz came nearest, with "
-            f"{100 * best_measurement.held:.2f} % of the ticks."
+            f"{100 * best_measurement.held_fraction:.2f} % of the ticks."
         )
     if between_stalls_hz is not None and between_stalls_hz != highest_hz:
         verdict_text += (
-            f" Without stalls of {STALL_US * 1e-3:g} ms and more, which affect any rate, it would "
+            f" Without stalls of {MIN_STALL_US * 1e-3:g} ms and more, which affect any rate, it "
+            "would "
             f"have held {between_stalls_hz:g} Hz."
         )
-    refused_names = [
+    refused_setting_names = [
         setting_name
-        for setting_name, setting_text in results.granted.items()
+        for setting_name, setting_text in results.granted_settings.items()
         if setting_text.startswith(REFUSED_PREFIX)
     ]
-    if refused_names:
+    if refused_setting_names:
         verdict_text += (
-            f" Not granted: {', '.join(refused_names).replace('_', ' ')}; rigd check says how."
+            f" Not granted: {', '.join(refused_setting_names).replace('_', ' ')}; "
+            "rigd check says how."
         )
-    cyclictest_result = results.peer
-    if cyclictest_result is not None and cyclictest_result.held < HELD_FRACTION:
+    cyclictest_result = results.cyclictest_measurement
+    if cyclictest_result is not None and cyclictest_result.held_fraction < MIN_HELD_FRACTION:
         verdict_text += (
-            f" cyclictest alone would have missed {100 * (1 - cyclictest_result.held):.2f} % at "
+            " cyclictest alone would have missed "
+            f"{100 * (1 - cyclictest_result.held_fraction):.2f} % at "
             f"{cyclictest_result.rate_hz:g} Hz: this is due to the computer itself."
         )
     return verdict_text
 
 
-def as_json(results: Results) -> dict[str, object]:
+def as_json(results: BenchResults) -> dict[str, object]:
     """Return the results as a JSON document."""
-    ratios = results.ratios()
+    latency_ratios = results.latency_ratios()
     return {
-        "profile": results.profile,
+        "profile": results.profile_name,
         "rate_hz": results.rate_hz,
-        "seconds": results.seconds,
+        "seconds": results.measurement_duration_s,
         "spin_us": results.spin_us,
-        "realtime": results.granted,
+        "realtime": results.granted_settings,
         "load_average": list(results.load_average),
         "rounds": [
             {"loop": _as_dict(loop_alone), "cyclictest": None if peer is None else _as_dict(peer)}
             for loop_alone, peer in results.rounds
         ],
-        "ratio_to_cyclictest": None if ratios is None else {"p50": ratios[0], "p99": ratios[1]},
-        "no_cyclictest": results.no_peer,
-        "sessions": [_as_dict(measurement) for measurement in results.sessions],
-        "rates": [_as_dict(measurement) for measurement in results.search],
+        "ratio_to_cyclictest": None
+        if latency_ratios is None
+        else {"p50": latency_ratios[0], "p99": latency_ratios[1]},
+        "no_cyclictest": results.missing_cyclictest_reason,
+        "sessions": [_as_dict(measurement) for measurement in results.session_measurements],
+        "rates": [_as_dict(measurement) for measurement in results.search_measurements],
         "highest_rate_hz": results.highest_rate_hz,
         "highest_rate_between_stalls_hz": results.highest_rate_between_stalls_hz,
         "verdict": verdict(results),
     }
 
 
-def _measurements(results: Results) -> list[LoopMeasurement]:
+def _measurements(results: BenchResults) -> list[LoopMeasurement]:
     """Return the measurements in the order of the report's table."""
-    cyclictest_result = results.peer
+    cyclictest_result = results.cyclictest_measurement
     return [
-        results.alone,
+        results.pooled_loop_measurement,
         *([] if cyclictest_result is None else [cyclictest_result]),
-        *results.sessions,
+        *results.session_measurements,
     ]
 
 
 def _latency_table(measurements: list[LoopMeasurement]) -> Iterator[str]:
     """Yield the lines of the report's table of wake-up latencies and execution times in µs."""
     yield (
-        f"{'':{_NAME_WIDTH}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   {'missed':>7}  "
+        f"{'':{_NAME_COLUMN_WIDTH}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   "
+        f"{'missed':>7}  "
         f"{'CPU':>5}  faults"
     )
     yield (
-        f"{'':{_NAME_WIDTH}}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}{'max':>8}   "
+        f"{'':{_NAME_COLUMN_WIDTH}}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}{'max':>8}   "
         f"{'p50':>8}{'p99':>8}   {'%':>7}  {'%':>5}"
     )
     for measurement in measurements:
         latency_percentiles = percentiles(measurement.lateness_us)
-        number_cells = (
+        shown_percentiles_us = (
             latency_percentiles.p50,
             latency_percentiles.p90,
             latency_percentiles.p99,
             latency_percentiles.p999,
             latency_percentiles.largest,
         )
-        cells_text = f"{measurement.name:{_NAME_WIDTH}}" + "".join(
-            f"{percentile_us:8.0f}" for percentile_us in number_cells
+        row_text = f"{measurement.name:{_NAME_COLUMN_WIDTH}}" + "".join(
+            f"{percentile_us:8.0f}" for percentile_us in shown_percentiles_us
         )
         if measurement.work_us.size:
-            work_percentiles = percentiles(measurement.work_us)
-            cells_text += f"   {work_percentiles.p50:8.0f}{work_percentiles.p99:8.0f}"
+            execution_percentiles = percentiles(measurement.work_us)
+            row_text += f"   {execution_percentiles.p50:8.0f}{execution_percentiles.p99:8.0f}"
         else:
-            cells_text += " " * 19
-        cells_text += f"   {100 * (1 - measurement.held):7.3f}"
+            row_text += " " * 19
+        row_text += f"   {100 * (1 - measurement.held_fraction):7.3f}"
         if measurement.cpu_percent is not None and measurement.page_faults is not None:
-            cells_text += f"  {measurement.cpu_percent:5.1f}  {measurement.page_faults:6d}"
-        yield cells_text
+            row_text += f"  {measurement.cpu_percent:5.1f}  {measurement.page_faults:6d}"
+        yield row_text
 
 
-def _search_table(search: list[LoopMeasurement]) -> Iterator[str]:
+def _rate_table(search_measurements: list[LoopMeasurement]) -> Iterator[str]:
     """Yield the lines of the table of all rates at which the loop was measured."""
     yield (
         f"{'':>10}{'held, %':>9}{'but stalls':>12}{'stalls':>8}{'late p99, µs':>14}"
         f"{'exec p99, µs':>14}{'CPU, %':>8}"
     )
-    for measurement in sorted(search, key=lambda measurement: measurement.rate_hz):
-        cpu = "" if measurement.cpu_percent is None else f"{measurement.cpu_percent:8.1f}"
+    for measurement in sorted(search_measurements, key=lambda measurement: measurement.rate_hz):
+        cpu_text = "" if measurement.cpu_percent is None else f"{measurement.cpu_percent:8.1f}"
         yield (
             f"{measurement.rate_hz:7.0f} "
-            f"Hz{100 * measurement.held:9.3f}{100 * measurement.held_between_stalls:12.3f}"
-            f"{measurement.stalls:8d}{percentiles(measurement.lateness_us).p99:14.0f}"
-            f"{percentiles(measurement.work_us).p99:14.0f}{cpu}"
+            f"Hz{100 * measurement.held_fraction:9.3f}"
+            f"{100 * measurement.held_fraction_between_stalls:12.3f}"
+            f"{measurement.stall_count:8d}{percentiles(measurement.lateness_us).p99:14.0f}"
+            f"{percentiles(measurement.work_us).p99:14.0f}{cpu_text}"
         )
 
 
-def _peer_lines(results: Results) -> Iterator[str]:
+def _cyclictest_lines(results: BenchResults) -> Iterator[str]:
     """Yield the line that compares the loop with cyclictest."""
-    ratios = results.ratios()
-    if ratios is None:
-        yield f"No cyclictest to compare with: {results.no_peer}."
+    latency_ratios = results.latency_ratios()
+    if latency_ratios is None:
+        yield f"No cyclictest to compare with: {results.missing_cyclictest_reason}."
         return
     yield (
         f"Wake-up latency of the loop alone over cyclictest's, same core and policy, median of "
-        f"{len(results.rounds)} rounds in turn: p50 {ratios[0]:.2f}, p99 {ratios[1]:.2f}."
+        f"{len(results.rounds)} rounds in turn: p50 {latency_ratios[0]:.2f}, p99 "
+        f"{latency_ratios[1]:.2f}."
     )
 
 
@@ -206,17 +217,17 @@ def _as_dict(measurement: LoopMeasurement) -> dict[str, object]:
         "rate_hz": measurement.rate_hz,
         "scheduled": measurement.scheduled,
         "missed": measurement.missed,
-        "held": measurement.held,
-        "held_between_stalls": measurement.held_between_stalls,
-        "stalls": measurement.stalls,
+        "held": measurement.held_fraction,
+        "held_between_stalls": measurement.held_fraction_between_stalls,
+        "stalls": measurement.stall_count,
         "lateness_us": _percentiles_object(measurement.lateness_us),
         "work_us": _percentiles_object(measurement.work_us) if measurement.work_us.size else None,
         "cpu_percent": measurement.cpu_percent,
         "page_faults": measurement.page_faults,
         "histogram_us": dict(
             zip(
-                (f"{edge_us:g}" for edge_us in edges_us()),
-                counts_of(measurement.lateness_us),
+                (f"{edge_us:g}" for edge_us in histogram_edges_us()),
+                histogram_counts(measurement.lateness_us),
                 strict=True,
             )
         ),
@@ -234,28 +245,28 @@ _FIRST_EDGE_US, _LAST_EDGE_US = 1.0, 100_000.0
 """Lowest edge above 0 and highest edge of the histogram's bins, in µs."""
 _DECADE_STEPS = (1.0, 2.0, 5.0)
 """Edges of the histogram's bins within a decade, relative to the beginning of the decade."""
-_LABEL_WIDTH = 18
+_BIN_LABEL_WIDTH = 18
 """Width of the bins' labels in characters."""
-_BAR_WIDTH = 20
+_MAX_BAR_WIDTH = 20
 """Width of the longest bar in characters."""
 _BAR_CHARACTER = "█"
 """Character of which bars consist."""
 
 
-def edges_us() -> list[float]:
+def histogram_edges_us() -> list[float]:
     """Return the lower edges of the histogram's bins in µs.
 
     They are 0, 1, 2, 5, 10, …, 100 000; the last bin has no upper edge.
     """
-    decades = round(log10(_LAST_EDGE_US / _FIRST_EDGE_US))
-    return [0.0, *(s * 10.0**d for d in range(decades) for s in _DECADE_STEPS), _LAST_EDGE_US]
+    decade_count = round(log10(_LAST_EDGE_US / _FIRST_EDGE_US))
+    return [0.0, *(s * 10.0**d for d in range(decade_count) for s in _DECADE_STEPS), _LAST_EDGE_US]
 
 
-def counts_of(delays_us: npt.NDArray[np.float64]) -> list[int]:
+def histogram_counts(delays_us: npt.NDArray[np.float64]) -> list[int]:
     """Return how many delays in µs are in each bin of the histogram."""
-    bin_indices = np.searchsorted(edges_us(), delays_us, side="right") - 1
-    counts: list[int] = np.bincount(bin_indices, minlength=len(edges_us())).tolist()
-    return counts
+    bin_indices = np.searchsorted(histogram_edges_us(), delays_us, side="right") - 1
+    bin_counts: list[int] = np.bincount(bin_indices, minlength=len(histogram_edges_us())).tolist()
+    return bin_counts
 
 
 def histogram_lines(histogram_columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> list[str]:
@@ -264,37 +275,39 @@ def histogram_lines(histogram_columns: Sequence[tuple[str, npt.NDArray[np.float6
     Each column has a series' name and its delays in µs. The length of a bar is proportional to the
     logarithm of its count, so that rare delays are visible.
     """
-    bin_counts = [counts_of(delays_us) for _, delays_us in histogram_columns]
-    used_bins = [
+    counts_by_column = [histogram_counts(delays_us) for _, delays_us in histogram_columns]
+    used_bin_numbers = [
         bin_no
-        for bin_no in range(len(edges_us()))
-        if any(bin_totals[bin_no] for bin_totals in bin_counts)
+        for bin_no in range(len(histogram_edges_us()))
+        if any(bin_totals[bin_no] for bin_totals in counts_by_column)
     ]
-    if not used_bins:
+    if not used_bin_numbers:
         return []
-    longest_count = max(max(bin_totals) for bin_totals in bin_counts)
-    header_line = " " * (_LABEL_WIDTH + 3) + "".join(
-        f"{column_title:<{_BAR_WIDTH + 9}}" for column_title, _ in histogram_columns
+    largest_bin_count = max(max(bin_totals) for bin_totals in counts_by_column)
+    header_line = " " * (_BIN_LABEL_WIDTH + 3) + "".join(
+        f"{column_title:<{_MAX_BAR_WIDTH + 9}}" for column_title, _ in histogram_columns
     )
     text_lines = [header_line.rstrip()]
-    for bin_no in range(used_bins[0], used_bins[-1] + 1):
+    for bin_no in range(used_bin_numbers[0], used_bin_numbers[-1] + 1):
         bars_text = (
-            f"{_histogram_bar(bin_totals[bin_no], longest_count)}{bin_totals[bin_no]:>7}  "
-            for bin_totals in bin_counts
+            f"{_histogram_bar(bin_totals[bin_no], largest_bin_count)}{bin_totals[bin_no]:>7}  "
+            for bin_totals in counts_by_column
         )
-        text_lines.append(f"{_bin_label(bin_no):>{_LABEL_WIDTH}}   {''.join(bars_text)}".rstrip())
+        text_lines.append(
+            f"{_bin_label(bin_no):>{_BIN_LABEL_WIDTH}}   {''.join(bars_text)}".rstrip()
+        )
     return text_lines
 
 
-def _histogram_bar(bin_count: int, longest_count: int) -> str:
-    """Return the bar of a bin; `longest_count` is the count of the longest bar."""
-    bar_length = round((_BAR_WIDTH - 1) * log10(1 + bin_count) / log10(1 + longest_count))
-    return f"{_BAR_CHARACTER * bar_length:<{_BAR_WIDTH}}"
+def _histogram_bar(bin_count: int, largest_bin_count: int) -> str:
+    """Return the bar of a bin; `largest_bin_count` is the count of the longest bar."""
+    bar_length = round((_MAX_BAR_WIDTH - 1) * log10(1 + bin_count) / log10(1 + largest_bin_count))
+    return f"{_BAR_CHARACTER * bar_length:<{_MAX_BAR_WIDTH}}"
 
 
 def _bin_label(bin_index: int) -> str:
     """Return the label of a bin with its edges."""
-    bin_edges_us = edges_us()
+    bin_edges_us = histogram_edges_us()
     if bin_index + 1 == len(bin_edges_us):
         return f"{bin_edges_us[bin_index]:.0f} µs and more"
     return f"{bin_edges_us[bin_index]:.0f}–{bin_edges_us[bin_index + 1]:.0f} µs"

@@ -9,16 +9,16 @@ import numpy.typing as npt
 
 from rigd.engine.shared_state import Phase
 
-HELD_FRACTION = 0.999
+MIN_HELD_FRACTION = 0.999
 """Smallest fraction of ticks that must run within their periods so that the loop holds a rate."""
-STALL_US = 2000.0
+MIN_STALL_US = 2000.0
 """Smallest wake-up latency in µs that counts as a stall.
 
 Firmware or the host of a virtual machine causes such delays, not the loop or its rate."""
 
 
 @dataclass(frozen=True, slots=True)
-class Usage:
+class ProcessUsage:
     """Processor time in s and number of page faults of a process since its start."""
 
     cpu_s: float
@@ -27,7 +27,7 @@ class Usage:
     """Number of page faults, including those that wait for a disk."""
 
 
-def process_usage(pid: int, proc: Path = Path("/proc")) -> Usage:
+def process_usage(pid: int, proc_folder: Path = Path("/proc")) -> ProcessUsage:
     """Return the processor time and page faults of a process with one thread since its start.
 
     The time is taken from the scheduler's statistics, in nanoseconds. The usual statistics sample
@@ -37,7 +37,7 @@ def process_usage(pid: int, proc: Path = Path("/proc")) -> Usage:
     ----------
     pid
         Process id.
-    proc
+    proc_folder
         Folder with the kernel's process table.
 
     Raises
@@ -46,9 +46,9 @@ def process_usage(pid: int, proc: Path = Path("/proc")) -> Usage:
         If the process has ended.
     """
     # The process's name, in brackets, may contain any character.
-    stat_fields = (proc / str(pid) / "stat").read_text().rpartition(")")[2].split()
-    cpu_ns = int((proc / str(pid) / "schedstat").read_text().split()[0])
-    return Usage(cpu_ns * 1e-9, int(stat_fields[7]) + int(stat_fields[9]))
+    stat_fields = (proc_folder / str(pid) / "stat").read_text().rpartition(")")[2].split()
+    cpu_ns = int((proc_folder / str(pid) / "schedstat").read_text().split()[0])
+    return ProcessUsage(cpu_ns * 1e-9, int(stat_fields[7]) + int(stat_fields[9]))
 
 
 class UsageMeter:
@@ -62,16 +62,16 @@ class UsageMeter:
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._readings: list[tuple[float, Usage]] = []
+        self._readings: list[tuple[float, ProcessUsage]] = []
 
-    def sample(self, phase: Phase) -> None:
+    def sample_usage(self, phase: Phase) -> None:
         """Read the processor time and page faults so far, if the session's record is running."""
         if phase == Phase.RUNNING:
             try:
-                process_reading = process_usage(self._pid)
+                present_usage = process_usage(self._pid)
             except OSError:
                 return  # this kernel has no such statistics
-            self._readings = [*self._readings[:1], (time.monotonic(), process_reading)]
+            self._readings = [*self._readings[:1], (time.monotonic(), present_usage)]
 
     @property
     def cpu_percent(self) -> float | None:
@@ -127,24 +127,24 @@ class LoopMeasurement:
     """Number of page faults of the loop's process, or None if they were not counted."""
 
     @property
-    def held(self) -> float:
+    def held_fraction(self) -> float:
         """Fraction of scheduled ticks that were run within their periods."""
         return 1.0 - self.missed / self.scheduled
 
     @property
-    def held_between_stalls(self) -> float:
+    def held_fraction_between_stalls(self) -> float:
         """Fraction of scheduled ticks outside of stalls that were run within their periods."""
-        stalls_us = self.lateness_us[self.lateness_us >= STALL_US]
+        stalls_us = self.lateness_us[self.lateness_us >= MIN_STALL_US]
         stalled_ticks = min(self.missed, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum()))
         return 1.0 - (self.missed - stalled_ticks) / (self.scheduled - stalled_ticks)
 
     @property
-    def stalls(self) -> int:
-        """Number of wake-up latencies of at least `STALL_US`."""
-        return int(np.count_nonzero(self.lateness_us >= STALL_US))
+    def stall_count(self) -> int:
+        """Number of wake-up latencies of at least `MIN_STALL_US`."""
+        return int(np.count_nonzero(self.lateness_us >= MIN_STALL_US))
 
 
-def percentiles(values_us: npt.NDArray[np.float64]) -> LatencyPercentiles:
+def percentiles(delays_us: npt.NDArray[np.float64]) -> LatencyPercentiles:
     """Return the percentiles of delays in µs, of which there must be at least one.
 
     Examples
@@ -155,10 +155,12 @@ def percentiles(values_us: npt.NDArray[np.float64]) -> LatencyPercentiles:
     >>> found.p50, found.p99, found.largest
     (50.0, 99.0, 100.0)
     """
-    return LatencyPercentiles(*np.percentile(values_us, [50, 90, 99, 99.9, 100]).tolist())
+    return LatencyPercentiles(*np.percentile(delays_us, [50, 90, 99, 99.9, 100]).tolist())
 
 
-def wake_ups_us(sample_records: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np.float64]:
+def wake_up_latencies_us(
+    sample_records: npt.NDArray[np.void], rate_hz: float
+) -> npt.NDArray[np.float64]:
     """Return the wake-up latency of each sample in µs, relative to the awaited deadline.
 
     The lateness in a sample is relative to the tick that was run. After missed ticks this tick is
@@ -173,13 +175,13 @@ def wake_ups_us(sample_records: npt.NDArray[np.void], rate_hz: float) -> npt.NDA
     """
     tick_numbers: npt.NDArray[np.int64] = sample_records["tick"].astype(np.int64)
     missed_ticks = np.diff(tick_numbers, prepend=-1) - 1
-    latency_us: npt.NDArray[np.float64] = sample_records["lateness_ns"] * 1e-3 + missed_ticks * (
+    latencies_us: npt.NDArray[np.float64] = sample_records["lateness_ns"] * 1e-3 + missed_ticks * (
         1e6 / rate_hz
     )
-    return latency_us
+    return latencies_us
 
 
-def record_measurement(
+def measurement_from_samples(
     name: str,
     rate_hz: float,
     sample_records: npt.NDArray[np.void],
@@ -206,7 +208,7 @@ def record_measurement(
     return LoopMeasurement(
         name,
         rate_hz,
-        wake_ups_us(sample_records, rate_hz),
+        wake_up_latencies_us(sample_records, rate_hz),
         sample_records["work_ns"] * 1e-3,
         scheduled_ticks,
         scheduled_ticks - sample_records.size,
@@ -225,12 +227,12 @@ def pool_measurements(name: str, measurements: list[LoopMeasurement]) -> LoopMea
     measurements
         Measurements at one rate, at least one.
     """
-    cpu_loads = [
+    cpu_loads_percent = [
         measurement.cpu_percent
         for measurement in measurements
         if measurement.cpu_percent is not None
     ]
-    page_faults = [
+    page_fault_counts = [
         measurement.page_faults
         for measurement in measurements
         if measurement.page_faults is not None
@@ -242,6 +244,6 @@ def pool_measurements(name: str, measurements: list[LoopMeasurement]) -> LoopMea
         np.concatenate([measurement.work_us for measurement in measurements]),
         sum(measurement.scheduled for measurement in measurements),
         sum(measurement.missed for measurement in measurements),
-        sum(cpu_loads) / len(cpu_loads) if cpu_loads else None,
-        sum(page_faults) if page_faults else None,
+        sum(cpu_loads_percent) / len(cpu_loads_percent) if cpu_loads_percent else None,
+        sum(page_fault_counts) if page_fault_counts else None,
     )

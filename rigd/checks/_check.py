@@ -87,14 +87,14 @@ def default_session_rows(profile: Profile) -> Iterator[CheckRow]:
     """
     try:
         chirp = excitation_for(profile, "chirp", {})
-        limit_percent = 100 * RigPreview(profile).fraction_of_limits(chirp.reference_rad)
+        percent_of_limits = 100 * RigPreview(profile).fraction_of_limits(chirp.reference_rad)
     except UserError:  # an unstable loop or an unknown value, which have rows of their own
         return
-    exceeds_limits = not limit_percent <= 100
+    exceeds_limits = not percent_of_limits <= 100
     yield CheckRow(
         "session",
         "chirp without options",
-        f"predicted peaks reach {limit_percent:.0f} % of a limit",
+        f"predicted peaks reach {percent_of_limits:.0f} % of a limit",
         "at most 100 %",
         grade(fail=False, warn=exceeds_limits),
         "Session: rigd run chirp is refused with its default amplitude; it names the limit and the "

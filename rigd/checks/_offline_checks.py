@@ -34,50 +34,50 @@ class UnknownRowError(UserError):
 class OfflineCheck:
     """Check of a rig's profile or computer that needs no device."""
 
-    rows: Callable[[Profile], Iterator[CheckRow]]
+    make_rows: Callable[[Profile], Iterator[CheckRow]]
     """Function that yields the rows of the check; rows that can fail have a name."""
-    names: tuple[str, ...] = ()
+    row_names: tuple[str, ...] = ()
     """Names of the rows that can fail, or none if the check only gives advice."""
-    not_acceptable: str = ""
+    unacceptable_reason: str = ""
     """Reason why a failure cannot be accepted for a session, or "" if it can be accepted."""
-    needs_values: bool = True
+    needs_known_values: bool = True
     """Whether the check computes with values of the profile.
 
     It is then omitted while any value is unknown."""
 
 
 OFFLINE_CHECKS: Final = (
-    OfflineCheck(offline.drive_file_rows, (offline.EDS_ROW,), needs_values=False),
-    OfflineCheck(offline.profile_rows, needs_values=False),
-    OfflineCheck(offline.record_rows, needs_values=False),
-    OfflineCheck(offline.axis_tilt_rows, needs_values=False),
+    OfflineCheck(offline.drive_file_rows, (offline.EDS_ROW,), needs_known_values=False),
+    OfflineCheck(offline.profile_rows, needs_known_values=False),
+    OfflineCheck(offline.record_rows, needs_known_values=False),
+    OfflineCheck(offline.axis_tilt_rows, needs_known_values=False),
     OfflineCheck(
-        offline.unknown_rows,
+        offline.unknown_value_rows,
         (offline.UNKNOWN_VALUES_ROW,),
-        not_acceptable="nothing can be computed without it",
-        needs_values=False,
+        unacceptable_reason="nothing can be computed without it",
+        needs_known_values=False,
     ),
     OfflineCheck(
         lambda profile: offline.wiring_rows(profile.rig),
         (offline.CAN_IDENTIFIERS_ROW, offline.CAN_LOAD_ROW, offline.SERIAL_LOAD_ROW),
-        not_acceptable="devices could receive what is not meant for them, or too late",
-        needs_values=False,
+        unacceptable_reason="devices could receive what is not meant for them, or too late",
+        needs_known_values=False,
     ),
     OfflineCheck(
         offline.added_device_rows,
-        (offline.DEVICE_ROW,),
-        not_acceptable="the device could not be used",
-        needs_values=False,
+        (offline.DEVICE_SETTINGS_ROW,),
+        unacceptable_reason="the device could not be used",
+        needs_known_values=False,
     ),
     OfflineCheck(
         offline.added_controller_rows,
         (offline.CONTROLLER_ROW,),
-        not_acceptable="the shaft could not be held",
+        unacceptable_reason="the shaft could not be held",
     ),
     OfflineCheck(
         closed_loop.stability_rows,
         (closed_loop.STABILITY_ROW,),
-        not_acceptable="the shaft could not be held",
+        unacceptable_reason="the shaft could not be held",
     ),
     OfflineCheck(closed_loop.margin_rows),
     OfflineCheck(
@@ -92,11 +92,11 @@ OFFLINE_CHECKS: Final = (
 )
 """All offline checks, in the order of their rows; checks of the same group are adjacent."""
 
-ACCEPTABLE: Final = tuple(
-    name for check in OFFLINE_CHECKS for name in check.names if not check.not_acceptable
+ACCEPTABLE_ROW_NAMES: Final = tuple(
+    name for check in OFFLINE_CHECKS for name in check.row_names if not check.unacceptable_reason
 )
 """Names of the rows whose failure the operator can accept for a session."""
-_CHECK_BY_ROW_NAME: Final = {name: check for check in OFFLINE_CHECKS for name in check.names}
+_CHECK_BY_ROW_NAME: Final = {name: check for check in OFFLINE_CHECKS for name in check.row_names}
 """Map from the name of a row that can fail to its check."""
 
 
@@ -109,8 +109,8 @@ def offline_rows(profile: Profile) -> list[CheckRow]:
 
 def _rows_of_check(offline_check: OfflineCheck, profile: Profile) -> Iterator[CheckRow]:
     """Yield a check's result rows, or none if it needs a value that the profile lacks."""
-    if not (offline_check.needs_values and unknown_values(profile.rig)):
-        yield from offline_check.rows(profile)
+    if not (offline_check.needs_known_values and unknown_values(profile.rig)):
+        yield from offline_check.make_rows(profile)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ class OfflineCheckResult:
         """Failed rows that the operator has accepted for the session."""
         return tuple(failed_check for failed_check in self.failed if failed_check.accepted)
 
-    def require(self) -> None:
+    def require_passed(self) -> None:
         """Raise CheckFailedError unless all failed rows are accepted.
 
         Raises
@@ -159,18 +159,22 @@ class OfflineCheckResult:
             If a failed row is not accepted; the message names each of them.
         """
         if self.refusals:
-            never_acceptable = not all(failed_check.acceptable for failed_check in self.failed)
-            raise CheckFailedError("\n".join(self.refusals), wrong_use=never_acceptable)
+            has_unacceptable_failure = not all(
+                failed_check.acceptable for failed_check in self.failed
+            )
+            raise CheckFailedError("\n".join(self.refusals), wrong_use=has_unacceptable_failure)
 
 
-def run_offline_checks(profile: Profile, accepted_names: Sequence[str] = ()) -> OfflineCheckResult:
+def run_offline_checks(
+    profile: Profile, accepted_row_names: Sequence[str] = ()
+) -> OfflineCheckResult:
     """Run the offline checks for a session, and return which rows failed or are accepted.
 
     Parameters
     ----------
     profile
         Profile of the rig, with the beam of the session.
-    accepted_names
+    accepted_row_names
         Names of rows that may fail in this session.
 
     Returns
@@ -183,29 +187,34 @@ def run_offline_checks(profile: Profile, accepted_names: Sequence[str] = ()) -> 
     UnknownRowError
         If no row has such a name, or its failure cannot be accepted.
     """
-    for row_name in accepted_names:
+    for row_name in accepted_row_names:
         _require_acceptable_name(row_name)
-    failed_rows: dict[str, FailedCheck] = {}
+    failed_check_by_row: dict[str, FailedCheck] = {}
     for offline_check in OFFLINE_CHECKS:
-        for row in _rows_of_check(offline_check, profile) if offline_check.names else ():
+        for row in _rows_of_check(offline_check, profile) if offline_check.row_names else ():
             if row.verdict is not CheckResult.FAIL:
                 continue
             row_name, names_text = row.name, _failure_text(row)
             if (
-                row_name in failed_rows
+                row_name in failed_check_by_row
             ):  # several rows of one name: an EDS file that lacks two objects
-                names_text = f"{failed_rows[row_name].text}\n{names_text}"
-            failed_rows[row_name] = FailedCheck(
-                row_name, names_text, not offline_check.not_acceptable, row_name in accepted_names
+                names_text = f"{failed_check_by_row[row_name].text}\n{names_text}"
+            failed_check_by_row[row_name] = FailedCheck(
+                row_name,
+                names_text,
+                not offline_check.unacceptable_reason,
+                row_name in accepted_row_names,
             )
-    accepted_needlessly = [
-        row_name for row_name in dict.fromkeys(accepted_names) if row_name not in failed_rows
+    needlessly_accepted_names = [
+        row_name
+        for row_name in dict.fromkeys(accepted_row_names)
+        if row_name not in failed_check_by_row
     ]
     return OfflineCheckResult(
-        tuple(failed_rows.values()),
+        tuple(failed_check_by_row.values()),
         tuple(
             f"--accept {row_name}: it did not fail; nothing was accepted."
-            for row_name in accepted_needlessly
+            for row_name in needlessly_accepted_names
         ),
     )
 
@@ -217,12 +226,12 @@ def _require_acceptable_name(row_name: str) -> None:
         raise UnknownRowError(
             f"--accept {row_name[:60]}: no row of rigd check has that name; those that can "
             "be accepted "
-            f"are {', '.join(ACCEPTABLE)}."
+            f"are {', '.join(ACCEPTABLE_ROW_NAMES)}."
         )
-    if offline_check.not_acceptable:
+    if offline_check.unacceptable_reason:
         raise UnknownRowError(
             f"--accept {row_name}: a failure of that row cannot be accepted: "
-            f"{offline_check.not_acceptable}."
+            f"{offline_check.unacceptable_reason}."
         )
 
 

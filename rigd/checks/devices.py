@@ -27,7 +27,7 @@ from rigd.plugins import plugin_errors
 from rigd.profile import Profile
 from rigd.safety.probing_move import PROBED_KEYS
 
-_SCALE_OBJECTS = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
+_OBJECT_NUMBERS_BY_SCALE = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
 """Map from a position scale that a drive need not state to the CiA 402 objects that state it."""
 _HEXADECIMAL_KEYS = ("vendor_id", "product_code", "supported_modes")
 """Keys of a drive's identity that are shown as hexadecimal numbers."""
@@ -49,7 +49,7 @@ _WATCHDOG_ADVICE = {  # Advice on watchdogs that were not proven on the drive
 
 
 @runtime_checkable
-class InspectableDrive(Protocol):
+class IdentifiableDrive(Protocol):
     """Drive that can report its identity; drives simulated in this process cannot."""
 
     def identity(self) -> Mapping[str, object]:
@@ -60,30 +60,30 @@ class InspectableDrive(Protocol):
 
 
 @runtime_checkable
-class InspectedDrive(Protocol):
+class DriveWithCapabilities(Protocol):
     """Drive whose CiA 402 objects were checked when it was connected."""
 
     def capabilities(self) -> DriveCapabilities | None:
         """Return the capabilities found at connection, or None if none were checked."""
 
 
-def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRow]:
+def _drive_rows(drive: IdentifiableDrive, rig: RigParameters) -> Iterator[CheckRow]:
     """Yield check results on the drive's identity, rated torque and safeguards.
 
     None of these checks fails: a drive that contradicts the profile was refused when connecting.
     """
     drive_settings = rig.cia402
-    wanted_texts = {
+    wanted_text_by_key = {
         "rated_torque_nm": f"{rig.motor.rated_torque_nm:.4g} N·m",
         "supported_modes": "0x200 (cyclic torque) among them",
     }
     if drive_settings is not None:
-        wanted_texts["gear_ratio"] = f"{drive_settings.gear_ratio:.5g}"
-        wanted_texts["encoder_step_rad"] = f"{rig.encoder.resolution_rad:.4g} rad"
-        wanted_texts["vendor_id"] = (
+        wanted_text_by_key["gear_ratio"] = f"{drive_settings.gear_ratio:.5g}"
+        wanted_text_by_key["encoder_step_rad"] = f"{rig.encoder.resolution_rad:.4g} rad"
+        wanted_text_by_key["vendor_id"] = (
             f"{drive_settings.vendor_id:#x}" if drive_settings.vendor_id else "any"
         )
-        wanted_texts["product_code"] = (
+        wanted_text_by_key["product_code"] = (
             f"{drive_settings.product_code:#x}" if drive_settings.product_code else "any"
         )
     for key, found_value in drive.identity().items():
@@ -96,11 +96,15 @@ def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRo
                 else format_value(key, found_value)
             )
         check_result = CheckResult.OK
-        if key in _SCALE_OBJECTS and found_value is None:
-            found_text = f"unknown: the drive does not state it (object {_SCALE_OBJECTS[key]})"
+        if key in _OBJECT_NUMBERS_BY_SCALE and found_value is None:
+            found_text = (
+                f"unknown: the drive does not state it (object {_OBJECT_NUMBERS_BY_SCALE[key]})"
+            )
             check_result = CheckResult.SKIPPED
-        yield CheckRow("drive", key_label(key), found_text, wanted_texts.get(key, ""), check_result)
-    capabilities = drive.capabilities() if isinstance(drive, InspectedDrive) else None
+        yield CheckRow(
+            "drive", key_label(key), found_text, wanted_text_by_key.get(key, ""), check_result
+        )
+    capabilities = drive.capabilities() if isinstance(drive, DriveWithCapabilities) else None
     if capabilities is not None:
         yield from _safeguard_rows(capabilities)
 
@@ -108,13 +112,13 @@ def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRo
 def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
     """Yield check results on the drive's watchdog, missing objects, and objects that were set."""
     watchdog, watchdog_s = capabilities.watchdog, capabilities.watchdog_timeout_s
-    is_unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
+    is_unproven_watchdog = watchdog in (Watchdog.OWN, Watchdog.NONE)
     yield CheckRow(
         "drive",
         "watchdog",
         f"{watchdog.value}, {watchdog_s * 1e3:g} ms" if isfinite(watchdog_s) else "none: accepted",
         "switches the torque off if this computer stops communicating",
-        CheckResult.WARNING if is_unproven else CheckResult.OK,
+        CheckResult.WARNING if is_unproven_watchdog else CheckResult.OK,
         _WATCHDOG_ADVICE.get(watchdog, ""),
     )
     accepted_features = capabilities.accepted_missing_functions
@@ -155,7 +159,7 @@ _RATE_ERROR_WARNING, _RATE_ERROR_FAILURE = 0.01, 0.05
 
 The first is more than clocks differ by; the second is too much for the filter's weights."""
 
-_NOT_REPORTED = "not stated by the sensor"
+_NOT_REPORTED_TEXT = "not stated by the sensor"
 """Text for a value that the sensor does not report."""
 _RANGE_KEYS = ("range_n_nm", "range")
 """Keys of a calibration that hold the sensor's measuring range."""
@@ -227,7 +231,7 @@ def calibration_rows(calibration: Mapping[str, object], rig: RigParameters) -> I
             "none",
             grade(fail=False, warn=bool(sensor_status)),
         )
-    other_values = [
+    other_value_texts = [
         f"{key_label(key)} {format_value(key, found_value)}"
         for key, found_value in calibration.items()
         if key
@@ -241,23 +245,29 @@ def calibration_rows(calibration: Mapping[str, object], rig: RigParameters) -> I
         )
         and found_value != ""
     ]
-    if other_values:
-        detail_text = f"Sensor: {'; '.join(other_values)}."
-        count_text = "1 value" if len(other_values) == 1 else f"{len(other_values)} values"
-        yield CheckRow("sensor", "more", f"{count_text}, below", "", CheckResult.OK, detail_text)
+    if other_value_texts:
+        detail_text = f"Sensor: {'; '.join(other_value_texts)}."
+        value_count_text = (
+            "1 value" if len(other_value_texts) == 1 else f"{len(other_value_texts)} values"
+        )
+        yield CheckRow(
+            "sensor", "more", f"{value_count_text}, below", "", CheckResult.OK, detail_text
+        )
 
 
 def _measured_rows(
-    measured_values: Mapping[str, float], rig: RigParameters, gap_cause: str = ""
+    measured_values: Mapping[str, float], rig: RigParameters, longest_gap_cause: str = ""
 ) -> Iterator[CheckRow]:
     """Yield check results on the sensor's measured rate and response times.
 
-    `gap_cause` is the reason for gaps that the sensor reports.
+    `longest_gap_cause` is the reason for gaps that the sensor reports.
     """
     for key, measured_value in measured_values.items():
         wanted_text, check_result = _assess_diagnostic(key, measured_value, rig)
         detail_text = (
-            gap_cause if key == "longest_gap_s" and check_result is not CheckResult.OK else ""
+            longest_gap_cause
+            if key == "longest_gap_s" and check_result is not CheckResult.OK
+            else ""
         )
         yield CheckRow(
             "sensor",
@@ -269,30 +279,34 @@ def _measured_rows(
         )
 
 
-def _format_calibration_value(key: str, calibration: Mapping[str, object]) -> str:
+def _format_calibration_value(calibration_key: str, calibration: Mapping[str, object]) -> str:
     """Format the value of a key of the calibration with its unit."""
-    calibration_value = calibration.get(key)
+    calibration_value = calibration.get(calibration_key)
     return (
-        _NOT_REPORTED if calibration_value in (None, "") else format_value(key, calibration_value)
+        _NOT_REPORTED_TEXT
+        if calibration_value in (None, "")
+        else format_value(calibration_key, calibration_value)
     )
 
 
-def _required_calibration_value(key: str, rig: RigParameters) -> str:
+def _required_calibration_value(calibration_key: str, rig: RigParameters) -> str:
     """Return the value of a key of the calibration that the profile requires, or ""."""
-    if key != "serial_number":
+    if calibration_key != "serial_number":
         return ""
-    all_settings = (rig.ati_can, rig.ati_serial, *rig.added_settings)
-    return next(filter(None, (getattr(each, key, "") for each in all_settings)), "any")
+    sensor_settings = (rig.ati_can, rig.ati_serial, *rig.added_settings)
+    return next(
+        filter(None, (getattr(each, calibration_key, "") for each in sensor_settings)), "any"
+    )
 
 
 def _range_row(calibration: Mapping[str, object], profile_range: tuple[float, ...]) -> CheckRow:
     """Return the result that compares the sensor's measuring range with that of the profile."""
     limits_text = "profile: " + format_value("range_n_nm", profile_range)
-    key = next((key for key in _RANGE_KEYS if key in calibration), "")
-    reported_range = calibration.get(key)
+    range_key = next((range_key for range_key in _RANGE_KEYS if range_key in calibration), "")
+    reported_range = calibration.get(range_key)
     if not isinstance(reported_range, list | tuple):
         # Over CAN the range cannot be requested.
-        return CheckRow("sensor", "range", _NOT_REPORTED, limits_text, CheckResult.OK)
+        return CheckRow("sensor", "range", _NOT_REPORTED_TEXT, limits_text, CheckResult.OK)
     exceeds_range = any(
         profile_value > _RANGE_TOLERANCE_FACTOR * float(sensor_value)
         for profile_value, sensor_value in zip(profile_range, reported_range, strict=True)
@@ -307,48 +321,48 @@ def _range_row(calibration: Mapping[str, object], profile_range: tuple[float, ..
 
 
 def _assess_diagnostic(
-    key: str, measured_value: float, rig: RigParameters
+    diagnostic_key: str, measured_value: float, rig: RigParameters
 ) -> tuple[str, CheckResult]:
     """Return the required value of a measured diagnostic as text, and the check's result."""
     period_s = 1.0 / rig.rate_hz
     acquisition = rig.acquisition
-    same_tick = acquisition is not None and acquisition.mode == "same_tick"
-    deadline_s = acquisition.deadline_us * 1e-6 if acquisition and same_tick else period_s
+    uses_same_tick = acquisition is not None and acquisition.mode == "same_tick"
+    deadline_s = acquisition.deadline_us * 1e-6 if acquisition and uses_same_tick else period_s
     deadline_text = f"at most {deadline_s * 1e3:.4g} ms"
-    if key == "polls_hz":
+    if diagnostic_key == "polls_hz":
         return f"at least {rig.rate_hz:g} Hz", grade(fail=not measured_value >= rig.rate_hz)
-    if key == "records_hz" and (stated_hz := _stream_hz(rig)) is not None:
-        relative_error = abs(measured_value / stated_hz - 1.0)
+    if diagnostic_key == "records_hz" and (stated_hz := _sensor_stream_hz(rig)) is not None:
+        relative_rate_error = abs(measured_value / stated_hz - 1.0)
         return f"{stated_hz:g} Hz", grade(
-            fail=not relative_error <= _RATE_ERROR_FAILURE,
-            warn=relative_error > _RATE_ERROR_WARNING,
+            fail=not relative_rate_error <= _RATE_ERROR_FAILURE,
+            warn=relative_rate_error > _RATE_ERROR_WARNING,
         )
-    if key == "turnaround_median_s":
+    if diagnostic_key == "turnaround_median_s":
         return deadline_text, grade(fail=not measured_value <= deadline_s)
-    if key == "turnaround_p99_s":
+    if diagnostic_key == "turnaround_p99_s":
         return deadline_text, grade(fail=False, warn=not measured_value <= deadline_s)
-    if key == "longest_gap_s":
+    if diagnostic_key == "longest_gap_s":
         return f"at most {period_s * 1e3:.4g} ms", grade(fail=False, warn=measured_value > period_s)
     # All other diagnostics are counts of errors.
     return "0", grade(fail=False, warn=measured_value > 0)
 
 
-def _stream_hz(rig: RigParameters) -> float | None:
+def _sensor_stream_hz(rig: RigParameters) -> float | None:
     """Return the records per second that the sensor streams, or None if it is polled."""
-    kind = DEVICES.get(rig.devices.sensor)
-    if kind is None or kind.stream_hz is None:
+    sensor_kind = DEVICES.get(rig.devices.sensor)
+    if sensor_kind is None or sensor_kind.stream_hz is None:
         return None
-    with plugin_errors(DEVICES.owner(kind.name)):
-        return kind.stream_hz(rig)
+    with plugin_errors(DEVICES.owner(sensor_kind.name)):
+        return sensor_kind.stream_hz(rig)
 
 
 # Exchange of a tick
 
-EXCHANGE_TICKS = 500
+EXCHANGE_CHECK_TICKS = 500
 """Number of ticks in which the exchange with the devices is checked."""
-_MISSING_FRACTION_WARNING = 0.02
+_MISSING_REPLY_WARNING_FRACTION = 0.02
 """Fraction of ticks without a reply above which there is a warning."""
-_MISSING_FRACTION_FAILURE = 0.2
+_MISSING_REPLY_FAILURE_FRACTION = 0.2
 """Fraction of ticks without a reply above which the check fails."""
 _EXCHANGE_GROUP = "exchange"
 """Group of the rows on the exchange with the devices."""
@@ -357,7 +371,7 @@ _EXCHANGE_GROUP = "exchange"
 def _exchange_rows(
     profile: Profile, devices: Devices, target: ActuationTarget
 ) -> Iterator[CheckRow]:
-    """Run `EXCHANGE_TICKS` ticks without torque, and yield rows on delayed and missing replies.
+    """Run `EXCHANGE_CHECK_TICKS` ticks without torque, and yield rows on late and missing replies.
 
     The devices are connected but not enabled. If a simulated rig in lock-step moves, it waits for
     this computer, so that delays are meaningless. Raises DeviceError if a device reports an error
@@ -365,64 +379,64 @@ def _exchange_rows(
     """
     drive, sensor = devices.drive, devices.sensor
     period_ns = round(1e9 / profile.rig.rate_hz)
-    delays_ms, angles_rad = np.zeros(EXCHANGE_TICKS), np.zeros(EXCHANGE_TICKS)
+    reply_delays_ms, angles_rad = np.zeros(EXCHANGE_CHECK_TICKS), np.zeros(EXCHANGE_CHECK_TICKS)
     missing_angles = missing_wrenches = saturated_ticks = 0
     real_clock = RealClock()
-    due_ns = real_clock.now_ns()
-    for tick_number in range(EXCHANGE_TICKS):
-        due_ns = max(due_ns + period_ns, real_clock.now_ns())
-        real_clock.wait_until(due_ns)
-        begin_ns = time.monotonic_ns()
-        drive.latch(due_ns)
-        sensor.request(due_ns)
+    tick_due_ns = real_clock.now_ns()
+    for tick_number in range(EXCHANGE_CHECK_TICKS):
+        tick_due_ns = max(tick_due_ns + period_ns, real_clock.now_ns())
+        real_clock.wait_until(tick_due_ns)
+        exchange_begin_ns = time.monotonic_ns()
+        drive.latch(tick_due_ns)
+        sensor.request(tick_due_ns)
         angles_rad[tick_number] = drive.read_angle()
         sensor.read_wrench()
-        delays_ms[tick_number] = (time.monotonic_ns() - begin_ns) * 1e-6
+        reply_delays_ms[tick_number] = (time.monotonic_ns() - exchange_begin_ns) * 1e-6
         missing_angles += drive.angle_stale
         missing_wrenches += sensor.wrench_stale
         saturated_ticks += sensor.wrench_saturated
 
-    yield _reply_row(profile, delays_ms, target)
+    yield _reply_row(profile, reply_delays_ms, target)
     for missing_text, missing_count in (
         ("angles missing", missing_angles),
         ("wrenches missing", missing_wrenches),
     ):
         check_result = grade(
-            fail=missing_count > _MISSING_FRACTION_FAILURE * EXCHANGE_TICKS,
-            warn=missing_count > _MISSING_FRACTION_WARNING * EXCHANGE_TICKS,
+            fail=missing_count > _MISSING_REPLY_FAILURE_FRACTION * EXCHANGE_CHECK_TICKS,
+            warn=missing_count > _MISSING_REPLY_WARNING_FRACTION * EXCHANGE_CHECK_TICKS,
         )
         yield CheckRow(
             _EXCHANGE_GROUP,
             missing_text,
-            f"{missing_count} of {EXCHANGE_TICKS} ticks",
-            f"at most {100 * _MISSING_FRACTION_WARNING:.0f} %",
+            f"{missing_count} of {EXCHANGE_CHECK_TICKS} ticks",
+            f"at most {100 * _MISSING_REPLY_WARNING_FRACTION:.0f} %",
             check_result,
         )
     yield CheckRow(
         _EXCHANGE_GROUP,
         "sensor saturated",
-        f"{saturated_ticks} of {EXCHANGE_TICKS} ticks",
+        f"{saturated_ticks} of {EXCHANGE_CHECK_TICKS} ticks",
         "0",
         grade(fail=saturated_ticks > 0),
     )
-    moved_rad = float(np.ptp(angles_rad))
-    allowed_rad = max(
-        profile.session.rest_velocity_rad_s * EXCHANGE_TICKS / profile.rig.rate_hz,
+    motion_rad = float(np.ptp(angles_rad))
+    allowed_motion_rad = max(
+        profile.session.rest_velocity_rad_s * EXCHANGE_CHECK_TICKS / profile.rig.rate_hz,
         2.0 * profile.rig.encoder.resolution_rad,
     )
     yield CheckRow(
         _EXCHANGE_GROUP,
         "shaft moved",
-        f"{moved_rad:.2g} rad",
-        f"at most {allowed_rad:.2g} rad",
-        grade(fail=False, warn=moved_rad > allowed_rad),
+        f"{motion_rad:.2g} rad",
+        f"at most {allowed_motion_rad:.2g} rad",
+        grade(fail=False, warn=motion_rad > allowed_motion_rad),
     )
 
 
-def _reply_row(profile: Profile, delays_ms: np.ndarray, target: ActuationTarget) -> CheckRow:
+def _reply_row(profile: Profile, reply_delays_ms: np.ndarray, target: ActuationTarget) -> CheckRow:
     """Return the result that compares the delays of the devices' replies with the deadline."""
     acquisition = profile.rig.acquisition
-    median_ms, p99_ms = np.percentile(delays_ms, [50, 99]).tolist()
+    median_ms, p99_ms = np.percentile(reply_delays_ms, [50, 99]).tolist()
     found_text = f"p50 {median_ms:.2f} ms, p99 {p99_ms:.2f} ms"
     row_label = "both replies after"
     if acquisition is None or acquisition.mode == "previous_tick":
@@ -437,10 +451,10 @@ def _reply_row(profile: Profile, delays_ms: np.ndarray, target: ActuationTarget)
         return CheckRow(
             _EXCHANGE_GROUP, row_label, found_text, "any time (lock-step)", CheckResult.OK
         )
-    limit_ms = acquisition.deadline_us * 1e-3
-    check_result = grade(fail=median_ms >= limit_ms, warn=p99_ms >= limit_ms)
+    deadline_ms = acquisition.deadline_us * 1e-3
+    check_result = grade(fail=median_ms >= deadline_ms, warn=p99_ms >= deadline_ms)
     return CheckRow(
-        _EXCHANGE_GROUP, row_label, found_text, f"less than {limit_ms:.2f} ms", check_result
+        _EXCHANGE_GROUP, row_label, found_text, f"less than {deadline_ms:.2f} ms", check_result
     )
 
 
@@ -451,17 +465,17 @@ def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRo
     """Yield the check result on whether scales and signs are known or need a probing move."""
     if target is ActuationTarget.SIMULATED:
         return
-    not_measured = [key for key in PROBED_KEYS if profile.sources.get(key) != "measured"]
-    if not not_measured:
+    unmeasured_keys = [key for key in PROBED_KEYS if profile.sources.get(key) != "measured"]
+    if not unmeasured_keys:
         found_text, check_result = "motor and encoder are measured", CheckResult.OK
     else:
         found_text = "scales and signs: verified by the probing move before the first session"
         check_result = CheckResult.SKIPPED
     detail_text = (
-        f"Probing move: sessions begin with it because {', '.join(not_measured)} "
-        f"{'is' if len(not_measured) == 1 else 'are'} not measured; rigd probe runs it alone "
+        f"Probing move: sessions begin with it because {', '.join(unmeasured_keys)} "
+        f"{'is' if len(unmeasured_keys) == 1 else 'are'} not measured; rigd probe runs it alone "
         "(docs/safety.md)."
-        if not_measured
+        if unmeasured_keys
         else ""
     )
     yield CheckRow("drive", "probing move", found_text, "", check_result, detail_text)
@@ -500,7 +514,7 @@ def _check_devices(
         yield CheckRow(
             "drive", "connection", _connection_text(target), "an answer, no fault", CheckResult.OK
         )
-        if isinstance(drive, InspectableDrive):
+        if isinstance(drive, IdentifiableDrive):
             yield from _drive_rows(drive, rig)
         yield from _probing_rows(profile, target)
 
@@ -521,15 +535,15 @@ def _check_devices(
             yield from _measured_rows(measured_values, rig, sensor.health().cause)
 
     # The drive is connected last, since an operational drive expects a SYNC every period.
-    sensor_ok = _collect_rows("sensor", sensor_rows(), check_rows) and _collect_rows(
+    is_sensor_ok = _collect_rows("sensor", sensor_rows(), check_rows) and _collect_rows(
         "sensor", rate_rows(), check_rows
     )
-    drive_ok = _collect_rows("drive", drive_rows(), check_rows)
+    is_drive_ok = _collect_rows("drive", drive_rows(), check_rows)
     if target is ActuationTarget.SIMULATED:
         check_rows.append(
             CheckRow("exchange", "ticks", "simulated in this process", "", CheckResult.SKIPPED)
         )
-    elif drive_ok and sensor_ok:
+    elif is_drive_ok and is_sensor_ok:
         _collect_rows("exchange", _exchange_rows(profile, devices, target), check_rows)
     else:
         skip_reason = "not without drive and sensor"
@@ -569,8 +583,8 @@ def _link_rows(rig: RigParameters, target: ActuationTarget) -> Iterator[CheckRow
         yield CheckRow("link", "CAN", bus_text, "", CheckResult.OK)
     sensor_kind = DEVICES.get(rig.devices.sensor)
     if sensor_kind is not None and sensor_kind.address is not None:
-        owner = DEVICES.owner(sensor_kind.name)
-        with plugin_errors(owner):
+        plugin_owner = DEVICES.owner(sensor_kind.name)
+        with plugin_errors(plugin_owner):
             sensor_address = sensor_kind.address(rig)
-        label = "serial" if owner is None else sensor_kind.name
-        yield CheckRow("link", label, sensor_address, "", CheckResult.OK)
+        link_label = "serial" if plugin_owner is None else sensor_kind.name
+        yield CheckRow("link", link_label, sensor_address, "", CheckResult.OK)

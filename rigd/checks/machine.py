@@ -49,7 +49,7 @@ _IDLE_STATES_ADVICE = (  # Advice if the depth of the processor's idle states ca
 )
 
 
-def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
+def granted_realtime_settings(requested_settings: RealtimeSettings) -> dict[str, str]:
     """Return the real-time settings that the system grants, as tried by a short-lived process.
 
     The keys are those of `apply_realtime`, for the control process. The key ``supervision`` holds
@@ -60,7 +60,11 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
     OSError, subprocess.SubprocessError, ValueError
         If the process cannot be started, or fails.
     """
-    setting_numbers = settings.priority, settings.supervision_priority, settings.cpu
+    setting_numbers = (
+        requested_settings.priority,
+        requested_settings.supervision_priority,
+        requested_settings.cpu,
+    )
     command_line = [*OWN_PYTHON, "-c", _GRANT_PROGRAM, *map(str, setting_numbers)]
     completed_process = subprocess.run(
         command_line, capture_output=True, text=True, timeout=_GRANT_TIMEOUT_S, check=True
@@ -77,7 +81,7 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
 def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
     """Yield check results on the real-time settings that the system would grant to a session."""
     try:
-        granted_settings = settings_granted(settings)
+        granted_settings = granted_realtime_settings(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         yield CheckRow(
             "real time", "rights", f"could not be tried: {error}", "", CheckResult.WARNING
@@ -108,17 +112,17 @@ def _setting_advice(setting_name: str, settings: RealtimeSettings) -> str:
     """Return the advice for a setting that was not granted, or "" if there is none."""
     if setting_name == "idle_states":
         return _IDLE_STATES_ADVICE
-    limits_lines = {
+    limits_file_lines = {
         "memory": f"{_user_name()} - memlock unlimited",
         "scheduling": f"{_user_name()} - rtprio {settings.priority}",
         "supervision": f"{_user_name()} - rtprio {settings.priority}",
     }
-    if setting_name not in limits_lines:
+    if setting_name not in limits_file_lines:
         return ""
     row_label = _ROW_LABELS.get(setting_name, setting_name).capitalize()
     return (
         f"{row_label}: put this line into /etc/security/limits.d/rigd.conf and log in again: "
-        f"{limits_lines[setting_name]}"
+        f"{limits_file_lines[setting_name]}"
     )
 
 
@@ -138,24 +142,24 @@ _CPU_FOLDER = Path("sys/devices/system/cpu")
 """Folder of the processor's settings, relative to the root of the file system."""
 _CLOCK_SOURCE_FILE = Path("sys/devices/system/clocksource/clocksource0/current_clocksource")
 """File with the name of the kernel's clock source."""
-_RUNTIME_FILE = Path("proc/sys/kernel/sched_rt_runtime_us")
+_REALTIME_RUNTIME_FILE = Path("proc/sys/kernel/sched_rt_runtime_us")
 """File with the microseconds of each period that real-time processes may use."""
-_PERIOD_FILE = Path("proc/sys/kernel/sched_rt_period_us")
+_REALTIME_PERIOD_FILE = Path("proc/sys/kernel/sched_rt_period_us")
 """File with the period in microseconds in which the kernel limits real-time processes."""
 _REALTIME_KERNEL_FILE = Path("sys/kernel/realtime")
 """File that contains 1 on a real-time kernel."""
-_TIMEX_SIZE = 512
+_TIMEX_BYTES = 512
 """Size in bytes of the buffer for the kernel's ``timex`` structure.
 
 It is larger than the structure on any architecture."""
-_TIME_ERROR_STATE = 5
+_CLOCK_ERROR_STATE = 5
 """State that ``adjtimex`` returns for a wall clock that is not synchronised (TIME_ERROR)."""
-_MIN_RUNTIME_FRACTION = 0.95
+_MIN_REALTIME_FRACTION = 0.95
 """Smallest fraction of each period for real-time processes; it is the kernel's default."""
 
 
 def machine_rows(
-    settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
+    settings: RealtimeSettings, root: Path = Path("/"), kernel_version: str = ""
 ) -> Iterator[CheckRow]:
     """Yield check results on settings of this computer that can delay ticks, with advice.
 
@@ -165,26 +169,28 @@ def machine_rows(
         Real-time settings of the profile.
     root
         Root of the file system from which the settings are read.
-    kernel
+    kernel_version
         Version of the kernel as in ``uname -v``, or "" for that of this computer.
     """
-    kernel = kernel or platform.version()
-    yield _kernel_row(root, kernel)
-    yield _virtual_row(root)
-    yield _core_row(settings, root)
+    kernel_version = kernel_version or platform.version()
+    yield _kernel_row(root, kernel_version)
+    yield _virtual_machine_row(root)
+    yield _isolated_core_row(settings, root)
     yield _governor_row(root)
     yield _clock_row(root)
     yield _wall_clock_row()
     yield _throttling_row(settings, root)
 
 
-def _kernel_row(root: Path, kernel: str) -> CheckRow:
+def _kernel_row(root: Path, kernel_version: str) -> CheckRow:
     """Return the check result on whether the kernel is a real-time kernel."""
-    is_preemptible = "PREEMPT_RT" in kernel or _read_or_empty(root / _REALTIME_KERNEL_FILE) == "1"
+    is_preemptible = (
+        "PREEMPT_RT" in kernel_version or _read_or_empty(root / _REALTIME_KERNEL_FILE) == "1"
+    )
     if is_preemptible:
         found_text = "PREEMPT_RT"
     else:
-        found_text = "preemptible" if "PREEMPT" in kernel else "not preemptible"
+        found_text = "preemptible" if "PREEMPT" in kernel_version else "not preemptible"
     return CheckRow(
         _COMPUTER_GROUP,
         "kernel",
@@ -199,33 +205,33 @@ def _kernel_row(root: Path, kernel: str) -> CheckRow:
     )
 
 
-def _virtual_row(root: Path) -> CheckRow:
+def _virtual_machine_row(root: Path) -> CheckRow:
     """Return the check result on whether this computer is a virtual machine."""
     cpu_info_words = set(_read_or_empty(root / "proc/cpuinfo").split())
-    is_virtual = "hypervisor" in cpu_info_words or bool(
+    is_virtual_machine = "hypervisor" in cpu_info_words or bool(
         _read_or_empty(root / "sys/hypervisor/type")
     )
     return CheckRow(
         _COMPUTER_GROUP,
         "hardware",
-        "virtual machine" if is_virtual else "no hypervisor seen",
+        "virtual machine" if is_virtual_machine else "no hypervisor seen",
         "a dedicated computer",
-        grade(fail=False, warn=is_virtual),
+        grade(fail=False, warn=is_virtual_machine),
         "Hardware: the hypervisor can suspend this machine for milliseconds, which nothing inside "
         "can prevent; run a real rig on a dedicated computer."
-        if is_virtual
+        if is_virtual_machine
         else "",
     )
 
 
-def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
+def _isolated_core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
     """Return the check result on whether the loop's core is isolated from other programs."""
-    isolated_numbers = isolated_cores(root)
-    cores_text = ", ".join(map(str, sorted(isolated_numbers)))
-    loop_core_isolated = (
-        settings.cpu in isolated_numbers if settings.cpu >= 0 else bool(isolated_numbers)
+    isolated_core_numbers = isolated_cores(root)
+    cores_text = ", ".join(map(str, sorted(isolated_core_numbers)))
+    is_loop_core_isolated = (
+        settings.cpu in isolated_core_numbers if settings.cpu >= 0 else bool(isolated_core_numbers)
     )
-    if settings.cpu >= 0 and isolated_numbers and not loop_core_isolated:
+    if settings.cpu >= 0 and isolated_core_numbers and not is_loop_core_isolated:
         found_text, remedy_text = (
             f"{cores_text}; the loop runs on {settings.cpu}",
             f"Isolated core: set realtime.cpu to -1 or to one of {cores_text}.",
@@ -237,8 +243,8 @@ def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
         "isolated core",
         found_text,
         "one",
-        grade(fail=False, warn=not loop_core_isolated),
-        "" if loop_core_isolated else remedy_text,
+        grade(fail=False, warn=not is_loop_core_isolated),
+        "" if is_loop_core_isolated else remedy_text,
     )
 
 
@@ -262,16 +268,16 @@ def _governor_row(root: Path) -> CheckRow:
         _read_or_empty(governor_file)
         for governor_file in sorted((root / _CPU_FOLDER).glob("cpu[0-9]*/cpufreq/scaling_governor"))
     }
-    is_slow = bool(governors - {"performance"})
+    is_slow_governor = bool(governors - {"performance"})
     return CheckRow(
         _COMPUTER_GROUP,
         "frequency governor",
         ", ".join(sorted(governors)) or "none: the frequency is not this system's",
         "performance",
-        grade(fail=False, warn=is_slow),
+        grade(fail=False, warn=is_slow_governor),
         "Frequency governor: an idle core slows down and takes longer for the next tick; "
         "cpupower frequency-set -g performance."
-        if is_slow
+        if is_slow_governor
         else "",
     )
 
@@ -280,15 +286,15 @@ def _clock_row(root: Path) -> CheckRow:
     """Return the check result on the kernel's clock source."""
     clock_source = _read_or_empty(root / _CLOCK_SOURCE_FILE)
     # Architectures other than x86 have a fast counter of their own.
-    is_fast = clock_source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
+    is_fast_clock = clock_source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
     return CheckRow(
         _COMPUTER_GROUP,
         "clock source",
         clock_source or "unknown",
         "tsc",
-        grade(fail=False, warn=not is_fast),
+        grade(fail=False, warn=not is_fast_clock),
         ""
-        if is_fast
+        if is_fast_clock
         else "Clock source: reading the time costs a microsecond each; the kernel log says why it "
         "does not trust the processor's counter (dmesg | grep -i tsc).",
     )
@@ -312,19 +318,23 @@ def _wall_clock_row() -> CheckRow:
 
 def _throttling_row(settings: RealtimeSettings, root: Path) -> CheckRow:
     """Return the result on the fraction of time that the kernel leaves to real-time processes."""
-    runtime_us = _read_number(root / _RUNTIME_FILE, -1)
-    period_us = _read_number(root / _PERIOD_FILE, 1_000_000)
-    runtime_fraction = runtime_us / period_us if runtime_us >= 0 else 1.0
-    is_too_low = runtime_fraction < _MIN_RUNTIME_FRACTION and settings.priority > 0
+    realtime_runtime_us = _read_number(root / _REALTIME_RUNTIME_FILE, -1)
+    realtime_period_us = _read_number(root / _REALTIME_PERIOD_FILE, 1_000_000)
+    realtime_fraction = (
+        realtime_runtime_us / realtime_period_us if realtime_runtime_us >= 0 else 1.0
+    )
+    is_realtime_limited = realtime_fraction < _MIN_REALTIME_FRACTION and settings.priority > 0
     return CheckRow(
         _COMPUTER_GROUP,
         "real-time share",
-        "all of a core" if runtime_us < 0 else f"{100 * runtime_fraction:.0f} % of a core",
-        f"{100 * _MIN_RUNTIME_FRACTION:.0f} %",
-        grade(fail=False, warn=is_too_low),
+        "all of a core"
+        if realtime_runtime_us < 0
+        else f"{100 * realtime_fraction:.0f} % of a core",
+        f"{100 * _MIN_REALTIME_FRACTION:.0f} %",
+        grade(fail=False, warn=is_realtime_limited),
         "Real-time share: the kernel stops real-time processes that take more; "
         "sysctl kernel.sched_rt_runtime_us=950000."
-        if is_too_low
+        if is_realtime_limited
         else "",
     )
 
@@ -332,10 +342,10 @@ def _throttling_row(settings: RealtimeSettings, root: Path) -> CheckRow:
 def _is_wall_clock_synchronised() -> bool:
     """Return whether the kernel reports a synchronised wall clock."""
     try:
-        clock_state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))
+        clock_state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
     except (OSError, AttributeError):
         return False
-    return 0 <= clock_state < _TIME_ERROR_STATE
+    return 0 <= clock_state < _CLOCK_ERROR_STATE
 
 
 def _read_or_empty(path: Path) -> str:

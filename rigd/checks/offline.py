@@ -80,7 +80,7 @@ def drive_file_rows(profile: Profile) -> Iterator[CheckRow]:
 
 # Profile and wiring
 
-HIGH_BUS_LOAD = 0.7
+HIGH_BUS_LOAD_FRACTION = 0.7
 """Bus load, as a fraction, above which there is a warning.
 
 An additional device, or repeated frames after a disturbance, would not fit."""
@@ -106,19 +106,19 @@ def record_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield the result on the longest possible record, and whether a default chirp fits into it."""
     chirp_parameters = signature(chirp).parameters
     limit_text = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
-    default_chirp_s = sum(
+    default_chirp_duration_s = sum(
         float(chirp_parameters[parameter_name].default)
         for parameter_name in ("rest_s", "duration_s", "ring_down_s")
     )
-    longest_s = MAX_SAMPLES / profile.rig.rate_hz
+    longest_record_s = MAX_SAMPLES / profile.rig.rate_hz
     yield CheckRow(
         "profile",
         "longest record",
-        f"{longest_s:g} s at {profile.rig.rate_hz:g} Hz",
-        f"{default_chirp_s:g} s (run chirp)",
-        grade(fail=False, warn=longest_s < default_chirp_s),
-        f"A chirp of {default_chirp_s:g} s is refused: {limit_text}."
-        if longest_s < default_chirp_s
+        f"{longest_record_s:g} s at {profile.rig.rate_hz:g} Hz",
+        f"{default_chirp_duration_s:g} s (run chirp)",
+        grade(fail=False, warn=longest_record_s < default_chirp_duration_s),
+        f"A chirp of {default_chirp_duration_s:g} s is refused: {limit_text}."
+        if longest_record_s < default_chirp_duration_s
         else "",
     )
 
@@ -144,36 +144,42 @@ def axis_tilt_rows(profile: Profile) -> Iterator[CheckRow]:
         )
     elif profile.axis_tilt_deg is None:
         found_text, check_result = "not known", CheckResult.WARNING
-        shift_percent = _tilt_shift_percent(profile.rig.beam, _EXAMPLE_TILT_DEG)
+        frequency_shift_percent = _tilt_frequency_shift_percent(profile.rig.beam, _EXAMPLE_TILT_DEG)
         detail_text = (
             "Axis plumb: gravity along the beam shifts its modes, mode 1 by "
-            f"{shift_percent:.2g} % for "
+            f"{frequency_shift_percent:.2g} % for "
             f"{_EXAMPLE_TILT_DEG:g}°, which an analysis can mistake for damping or for a mass at "
             "the tip. Measure the inclination of the motor's flange along the resting beam with a "
             "level, and state it as rig.axis_tilt_deg (positive: the tip is lower)."
         )
     else:
-        shift_percent = _tilt_shift_percent(profile.rig.beam, profile.axis_tilt_deg)
-        found_text = f"{profile.axis_tilt_deg:g}° off, mode 1 shifted by {shift_percent:+.2g} %"
+        frequency_shift_percent = _tilt_frequency_shift_percent(
+            profile.rig.beam, profile.axis_tilt_deg
+        )
+        found_text = (
+            f"{profile.axis_tilt_deg:g}° off, mode 1 shifted by {frequency_shift_percent:+.2g} %"
+        )
         detail_text, check_result = "", CheckResult.OK
     yield CheckRow("profile", "axis plumb", found_text, "measured", check_result, detail_text)
 
 
-def _tilt_shift_percent(beam: Beam, tilt_deg: float) -> float:
+def _tilt_frequency_shift_percent(beam: Beam, tilt_deg: float) -> float:
     """Return the first-order change in per cent of mode 1's frequency by gravity along the beam."""
-    first_rad_s = undamped_frequencies_rad_s(beam, 1)[0]
+    first_frequency_rad_s = undamped_frequencies_rad_s(beam, 1)[0]
     axial_gravity_m_per_s2 = _GRAVITY_M_PER_S2 * sin(radians(tilt_deg))
-    relative_shift = (
-        _AXIAL_LOAD_COEFFICIENT * axial_gravity_m_per_s2 / (2.0 * beam.length_m * first_rad_s**2)
+    relative_frequency_shift = (
+        _AXIAL_LOAD_COEFFICIENT
+        * axial_gravity_m_per_s2
+        / (2.0 * beam.length_m * first_frequency_rad_s**2)
     )
-    return float(100.0 * relative_shift)
+    return float(100.0 * relative_frequency_shift)
 
 
 UNKNOWN_VALUES_ROW = "unknown_values"
 """Name of the rows on required values that the profile states as unknown."""
 
 
-def unknown_rows(profile: Profile) -> Iterator[CheckRow]:
+def unknown_value_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield a failed row for each value that every session needs and the profile lacks."""
     for key in unknown_values(profile.rig):
         remedy_text = f"{key}: enter its value in {profile.path} ({MAY_BE_UNKNOWN[key]})."
@@ -192,45 +198,45 @@ def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
     if rig.can is not None:
         from rigd.devices.canbus import bus_load, check_identifiers
 
-        collisions = check_identifiers(rig)
-        for id_collision in collisions:
-            yield _identifier_row(id_collision, CheckResult.FAIL)
-        if not collisions:
-            yield _identifier_row("no collision", CheckResult.OK)
+        identifier_collisions = check_identifiers(rig)
+        for id_collision in identifier_collisions:
+            yield _can_identifier_row(id_collision, CheckResult.FAIL)
+        if not identifier_collisions:
+            yield _can_identifier_row("no collision", CheckResult.OK)
         yield _bus_row(bus_load(rig), rig.can.bitrate_bit_s)
     if rig.ati_serial is not None:
-        yield _line_row(rig.ati_serial)
+        yield _serial_line_row(rig.ati_serial)
 
 
-DEVICE_ROW = "device_settings"
+DEVICE_SETTINGS_ROW = "device_settings"
 """Name of the rows that installed packages add for their devices."""
 
 
 def added_device_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield the rows that the kinds of the profile's devices declare."""
-    for kind in selected_kinds(profile.rig.devices):
-        owner = DEVICES.owner(kind.name)
-        if owner is not None:
-            yield CheckRow("devices", kind.name, owner.label, "", CheckResult.OK)
-        if kind.check_rows is not None:
-            with plugin_errors(owner):
-                for row in kind.check_rows(profile.rig):
-                    yield replace(row, name=DEVICE_ROW)
+    for device_kind in selected_kinds(profile.rig.devices):
+        plugin_owner = DEVICES.owner(device_kind.name)
+        if plugin_owner is not None:
+            yield CheckRow("devices", device_kind.name, plugin_owner.label, "", CheckResult.OK)
+        if device_kind.check_rows is not None:
+            with plugin_errors(plugin_owner):
+                for row in device_kind.check_rows(profile.rig):
+                    yield replace(row, name=DEVICE_SETTINGS_ROW)
 
 
 CONTROLLER_ROW = "controller"
 """Name of the rows on the controller that an installed package adds."""
-_LARGEST_START_FRACTION = 1e-6
+_MAX_START_TORQUE_FRACTION = 1e-6
 """Largest torque of a controller at rest, as a fraction of the motor's peak torque."""
 
 
 def added_controller_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield the rows on the controller of an installed package; none for the shipped one."""
-    name = profile.control.controller
-    owner = CONTROLLERS.owner(name)
-    if owner is None:
+    controller_name = profile.control.controller
+    plugin_owner = CONTROLLERS.owner(controller_name)
+    if plugin_owner is None:
         return
-    yield CheckRow("controller", name, owner.label, "", CheckResult.OK)
+    yield CheckRow("controller", controller_name, plugin_owner.label, "", CheckResult.OK)
     rig = profile.controlled_rig()
     row_label, wanted_text = "torque after a reset", "0 N·m"
     try:
@@ -240,28 +246,30 @@ def added_controller_rows(profile: Profile) -> Iterator[CheckRow]:
             controller.reset(start_rad)
             controller.step(start_rad, start_rad, 0.0)
             start_torques_nm.append(abs(controller.unlimited_torque_nm))
-        kind = CONTROLLERS.load(owner)
-        with plugin_errors(owner):
-            declared_rows = () if kind.check_rows is None else tuple(kind.check_rows(rig))
+        controller_kind = CONTROLLERS.load(plugin_owner)
+        with plugin_errors(plugin_owner):
+            declared_rows = (
+                () if controller_kind.check_rows is None else tuple(controller_kind.check_rows(rig))
+            )
     except (ControllerError, ControlDesignError, PluginError) as error:
         yield CheckRow(
             "controller", row_label, str(error), wanted_text, CheckResult.FAIL, name=CONTROLLER_ROW
         )
         return
-    largest_nm = max(start_torques_nm)
+    largest_start_torque_nm = max(start_torques_nm)
     yield CheckRow(
         "controller",
         row_label,
-        f"{largest_nm:.3g} N·m",
+        f"{largest_start_torque_nm:.3g} N·m",
         wanted_text,
-        grade(fail=not largest_nm <= _LARGEST_START_FRACTION * rig.torque_limit_nm),
+        grade(fail=not largest_start_torque_nm <= _MAX_START_TORQUE_FRACTION * rig.torque_limit_nm),
         name=CONTROLLER_ROW,
     )
     for row in declared_rows:
         yield replace(row, name=CONTROLLER_ROW)
 
 
-def _identifier_row(found_text: str, check_result: CheckResult) -> CheckRow:
+def _can_identifier_row(found_text: str, check_result: CheckResult) -> CheckRow:
     """Return the check result on the CAN identifiers."""
     return CheckRow(
         "CAN bus", "identifiers", found_text, "no collision", check_result, name=CAN_IDENTIFIERS_ROW
@@ -279,29 +287,28 @@ def _bus_row(bus_load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
     return CheckRow(
         "CAN bus",
         "load",
-        f"{100 * bus_load.worst_case_load:.1f} % at worst, "
-        f"{100 * bus_load.load_without_stuffing:.1f} % without stuffing",
+        f"{100 * bus_load.worst_case_load:.1f} % at worst, {100 * bus_load.load_without_stuffing:.1f} % without stuffing",
         f"at most {100 * MAX_BUS_LOAD:.0f} %",
         grade(
             fail=bus_load.worst_case_load > MAX_BUS_LOAD,
-            warn=bus_load.worst_case_load > HIGH_BUS_LOAD,
+            warn=bus_load.worst_case_load > HIGH_BUS_LOAD_FRACTION,
         ),
         f"At {bitrate_bit_s / 1e3:g} kbit/s: {frames_text}.",
         CAN_LOAD_ROW,
     )
 
 
-def _line_row(serial_settings: "AtiSerial") -> CheckRow:
+def _serial_line_row(serial_settings: "AtiSerial") -> CheckRow:
     """Return the check result on the load of the serial line."""
     from rigd.devices.ati import RECORD_BITS
     from rigd.devices.canbus import MAX_BUS_LOAD
 
-    line_load = RECORD_BITS * serial_settings.stream_hz / serial_settings.baud
+    serial_line_load = RECORD_BITS * serial_settings.stream_hz / serial_settings.baud
     return CheckRow(
         "serial line",
         "load",
-        f"{100 * line_load:.1f} % of {serial_settings.baud} bit/s",
+        f"{100 * serial_line_load:.1f} % of {serial_settings.baud} bit/s",
         f"at most {100 * MAX_BUS_LOAD:.0f} %",
-        grade(fail=line_load > MAX_BUS_LOAD),
+        grade(fail=serial_line_load > MAX_BUS_LOAD),
         name=SERIAL_LOAD_ROW,
     )

@@ -14,8 +14,8 @@ _MILLISECONDS_PER_UNIT = {"s": 1e3, "ns": 1e-6, "µs": 1e-3}
 
 def key_label(key: str) -> str:
     """Return a key as a label: with spaces instead of underscores and without its unit's suffix."""
-    suffix = _unit_suffix(key)
-    return (key[: -len(suffix)] if suffix else key).replace("_", " ")
+    unit_suffix = _unit_suffix(key)
+    return (key[: -len(unit_suffix)] if unit_suffix else key).replace("_", " ")
 
 
 def format_value(key: str, value: object) -> str:
@@ -51,9 +51,9 @@ def _unit_suffix(key: str) -> str:
     return "" if key.endswith("_counts") else suffix_of(key)
 
 
-def _is_number(document_value: object) -> bool:
+def _is_number(checked_value: object) -> bool:
     """Return whether a value is an integer or a float, but not a boolean."""
-    return isinstance(document_value, int | float) and not isinstance(document_value, bool)
+    return isinstance(checked_value, int | float) and not isinstance(checked_value, bool)
 
 
 # Table
@@ -80,8 +80,8 @@ EDS_CONSEQUENCES = {
 """Consequence of the verdict over all rows of an EDS file, for the operator."""
 
 
-def print_table(
-    rows: Sequence[CheckRow], consequences: Mapping[str, str] = RIG_CONSEQUENCES
+def print_check_table(
+    rows: Sequence[CheckRow], consequence_by_verdict: Mapping[str, str] = RIG_CONSEQUENCES
 ) -> None:
     """Print the rows as a table, then their details and the verdict, to standard output.
 
@@ -89,7 +89,7 @@ def print_table(
     ----------
     rows
         Rows; those of a group are adjacent.
-    consequences
+    consequence_by_verdict
         Map from the verdict over all rows to its consequence, which is printed under the table.
     """
     from rich.box import SIMPLE_HEAD  # late: a session prints no table
@@ -102,22 +102,24 @@ def print_table(
     table.add_column("found", ratio=9, overflow="fold")
     table.add_column("wanted", ratio=5, overflow="fold")
     table.add_column("", no_wrap=True, width=7)
-    group = ""
-    shown_names: set[str] = set()
+    shown_group = ""
+    shown_row_names: set[str] = set()
     for row in rows:
-        if row.group != group:
-            group = row.group
+        if row.group != shown_group:
+            shown_group = row.group
             if table.row_count:
                 table.add_row()
-            table.add_row(Text(group, style="bold"))
-        style = _VERDICT_STYLES[row.verdict]
-        new_names = {row.name} - shown_names - {""}
-        shown_names |= new_names
+            table.add_row(Text(shown_group, style="bold"))
+        verdict_style = _VERDICT_STYLES[row.verdict]
+        new_row_names = {row.name} - shown_row_names - {""}
+        shown_row_names |= new_row_names
         table.add_row(
-            Text(f"  {row.what}").append("".join(f"\n  {name}" for name in new_names), style="dim"),
+            Text(f"  {row.what}").append(
+                "".join(f"\n  {name}" for name in new_row_names), style="dim"
+            ),
             Text(row.found),
             Text(row.wanted),
-            Text(row.verdict.value, style=style),
+            Text(row.verdict.value, style=verdict_style),
         )
     console = Console(highlight=False)
     console.print(table)
@@ -125,15 +127,19 @@ def print_table(
         if row.detail:
             console.print(Text(row.detail))
             console.print()
-    console.print(Text(_verdict_line(rows, consequences), style="bold"))
+    console.print(Text(_verdict_line(rows, consequence_by_verdict), style="bold"))
 
 
-def _verdict_line(rows: Sequence[CheckRow], consequences: Mapping[str, str]) -> str:
+def _verdict_line(rows: Sequence[CheckRow], consequence_by_verdict: Mapping[str, str]) -> str:
     """Return the line under the table: verdict, numbers of rows by result, and consequence."""
-    counts = {verdict: sum(row.verdict is verdict for row in rows) for verdict in CheckResult}
-    text = (
-        f"failed: {counts[CheckResult.FAIL]}, warnings: {counts[CheckResult.WARNING]}, "
-        f"ok: {counts[CheckResult.OK]}, skipped: {counts[CheckResult.SKIPPED]}"
+    row_count_by_verdict = {
+        verdict: sum(row.verdict is verdict for row in rows) for verdict in CheckResult
+    }
+    row_counts_text = (
+        f"failed: {row_count_by_verdict[CheckResult.FAIL]}, warnings: "
+        f"{row_count_by_verdict[CheckResult.WARNING]}, "
+        f"ok: {row_count_by_verdict[CheckResult.OK]}, skipped: "
+        f"{row_count_by_verdict[CheckResult.SKIPPED]}"
     )
     verdict = overall(rows)
-    return f"Verdict: {verdict} ({text}): {consequences[verdict]}."
+    return f"Verdict: {verdict} ({row_counts_text}): {consequence_by_verdict[verdict]}."

@@ -32,11 +32,11 @@ from rigd.safety.limits import Limits
 if TYPE_CHECKING:
     from rigd.devices.parameters import Motor
 
-_TIME_STEP_S = 5e-5
+_SIMULATION_STEP_S = 5e-5
 """Time step in seconds of the simulated motion under torque."""
 _MAX_STOPPING_DISTANCE_RAD = 100.0
 """Stopping distance in rad above which it counts as infinite."""
-_NEGLIGIBLE_VISCOUS_RATIO = 1e-6
+_NEGLIGIBLE_VISCOUS_FRICTION_RATIO = 1e-6
 """Ratio of viscous to Coulomb friction torque below which viscous friction is neglected."""
 _STOPPING_GROUP = "travel"
 """Group of the rows on the stopping distance."""
@@ -56,22 +56,22 @@ STOPPING_MISSED_TICKS_ROW = "travel_missed_ticks"
 class StoppingDistance:
     """Stopping distance of the shaft after a failure: angle under torque, then while coasting."""
 
-    driven_rad: float
+    driven_distance_rad: float
     """Angle that the shaft turns while the torque is still on; infinite above 100 rad."""
-    coasting_rad: float
+    coasting_distance_rad: float
     """Angle that the shaft turns without torque until friction has stopped it.
 
     It is infinite above 100 rad and without friction."""
 
     @property
-    def total_rad(self) -> float:
+    def total_distance_rad(self) -> float:
         """Angle in rad from the failure until the shaft is at rest."""
-        return self.driven_rad + self.coasting_rad
+        return self.driven_distance_rad + self.coasting_distance_rad
 
 
 @lru_cache(maxsize=64)
 def max_stopping_distance(
-    rig: RigParameters, limits: Limits, torque_on_s: float, max_speed_rad_s: float = inf
+    rig: RigParameters, limits: Limits, torque_duration_s: float, max_speed_rad_s: float = inf
 ) -> StoppingDistance:
     """Return the longest stopping distance that the limits allow while nothing controls the shaft.
 
@@ -79,7 +79,7 @@ def max_stopping_distance(
     ----------
     rig, limits
         Parameters and limits of the profile.
-    torque_on_s
+    torque_duration_s
         Time for which the torque remains on; infinite if nothing removes it.
     max_speed_rad_s
         Speed above which the drive itself exerts no torque.
@@ -89,44 +89,55 @@ def max_stopping_distance(
     The beam acts in the worst way: it does not brake the motor while the torque is on, and it turns
     with the shaft like a rigid body afterwards.
     """
-    if isinf(torque_on_s):
+    if isinf(torque_duration_s):
         return StoppingDistance(inf, inf)
     motor, beam = rig.motor, rig.beam
-    without_beam_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
-    with_beam_kg_m2 = without_beam_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
+    inertia_without_beam_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
+    inertia_with_beam_kg_m2 = (
+        inertia_without_beam_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
+    )
     speed_rad_s = limits.velocity_rad_s
-    under_torque_rad = 0.0
-    step_count = round(torque_on_s / _TIME_STEP_S)
+    driven_distance_rad = 0.0
+    step_count = round(torque_duration_s / _SIMULATION_STEP_S)
     for step_number in range(step_count):
         torque_nm = motor.peak_torque_nm - _friction_nm(rig, speed_rad_s)
-        faster_rad_s = max(0.0, speed_rad_s + torque_nm / without_beam_kg_m2 * _TIME_STEP_S)
-        previous_rad_s, speed_rad_s = speed_rad_s, min(faster_rad_s, max_speed_rad_s)
-        under_torque_rad += 0.5 * (previous_rad_s + speed_rad_s) * _TIME_STEP_S
+        unlimited_speed_rad_s = max(
+            0.0, speed_rad_s + torque_nm / inertia_without_beam_kg_m2 * _SIMULATION_STEP_S
+        )
+        previous_rad_s, speed_rad_s = speed_rad_s, min(unlimited_speed_rad_s, max_speed_rad_s)
+        driven_distance_rad += 0.5 * (previous_rad_s + speed_rad_s) * _SIMULATION_STEP_S
         if speed_rad_s == previous_rad_s:  # it goes on like this
-            under_torque_rad += speed_rad_s * (step_count - 1 - step_number) * _TIME_STEP_S
+            driven_distance_rad += speed_rad_s * (step_count - 1 - step_number) * _SIMULATION_STEP_S
             break
-        if under_torque_rad > _MAX_STOPPING_DISTANCE_RAD:
+        if driven_distance_rad > _MAX_STOPPING_DISTANCE_RAD:
             break
-    if under_torque_rad > _MAX_STOPPING_DISTANCE_RAD:
+    if driven_distance_rad > _MAX_STOPPING_DISTANCE_RAD:
         return StoppingDistance(inf, inf)
-    coasting_rad = _coasting_rad(with_beam_kg_m2, motor, speed_rad_s)
+    coasting_distance_rad = _coasting_distance_rad(inertia_with_beam_kg_m2, motor, speed_rad_s)
     return StoppingDistance(
-        under_torque_rad, coasting_rad if coasting_rad <= _MAX_STOPPING_DISTANCE_RAD else inf
+        driven_distance_rad,
+        coasting_distance_rad if coasting_distance_rad <= _MAX_STOPPING_DISTANCE_RAD else inf,
     )
 
 
-def _coasting_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> float:
+def _coasting_distance_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> float:
     """Return the angle in rad in which friction alone stops a rotating inertia.
 
     It is infinite if there is no friction.
     """
     viscous_nm_s_per_rad, coulomb_nm = motor.viscous_nm_s_per_rad, motor.coulomb_nm
-    viscous_ratio = viscous_nm_s_per_rad * speed_rad_s / coulomb_nm if coulomb_nm > 0.0 else inf
-    if viscous_ratio < _NEGLIGIBLE_VISCOUS_RATIO:
+    viscous_friction_ratio = (
+        viscous_nm_s_per_rad * speed_rad_s / coulomb_nm if coulomb_nm > 0.0 else inf
+    )
+    if viscous_friction_ratio < _NEGLIGIBLE_VISCOUS_FRICTION_RATIO:
         return 0.5 * inertia_kg_m2 * speed_rad_s**2 / coulomb_nm
     if viscous_nm_s_per_rad == 0.0:
         return inf if speed_rad_s > 0.0 else 0.0
-    coulomb_correction = log1p(viscous_ratio) / viscous_ratio if isfinite(viscous_ratio) else 0.0
+    coulomb_correction = (
+        log1p(viscous_friction_ratio) / viscous_friction_ratio
+        if isfinite(viscous_friction_ratio)
+        else 0.0
+    )
     return inertia_kg_m2 * speed_rad_s / viscous_nm_s_per_rad * (1.0 - coulomb_correction)
 
 
@@ -138,11 +149,11 @@ class _UncontrolledFailure:
     """Name of the check's row."""
     condition: str
     """Condition of the failure, as a clause for the operator ("if the encoder fails")."""
-    duration_s: float
+    torque_duration_s: float
     """Longest time for which the torque remains on."""
-    ended_by: str
+    torque_end_text: str
     """Limit or watchdog that removes the torque, with its key, as text for the operator."""
-    key: str
+    profile_key: str
     """Key of the profile that determines the duration."""
 
 
@@ -151,8 +162,8 @@ def _uncontrolled_failures(profile: Profile) -> tuple[_UncontrolledFailure, ...]
     rig, limits, drive_settings = profile.rig, profile.limits, profile.rig.cia402
     assert drive_settings is not None
     stale_ticks, missed_ticks = limits.stale_ticks_in_a_row, limits.missed_ticks_in_a_row
-    own_watchdog = drive_settings.watchdog_s > drive_settings.heartbeat_timeout_s
-    watchdog_key = "cia402.own_watchdog_s" if own_watchdog else "cia402.heartbeat_timeout_s"
+    is_own_watchdog = drive_settings.watchdog_s > drive_settings.heartbeat_timeout_s
+    watchdog_key = "cia402.own_watchdog_s" if is_own_watchdog else "cia402.heartbeat_timeout_s"
     return (
         _UncontrolledFailure(
             STOPPING_LOOP_FAILS_ROW,
@@ -204,69 +215,79 @@ def stopping_distance_rows(profile: Profile) -> Iterator[CheckRow]:
         )
         return
     uncontrolled_failures = _uncontrolled_failures(profile)
-    margin_rad = limits.stop_angle_rad - limits.angle_rad
-    bound_text = f"at most {margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)"
-    has_no_bound = isinf(drive_settings.watchdog_s)
-    if has_no_bound:
+    stopping_margin_rad = limits.stop_angle_rad - limits.angle_rad
+    margin_text = (
+        f"at most {stopping_margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)"
+    )
+    has_no_watchdog = isinf(drive_settings.watchdog_s)
+    if has_no_watchdog:
         uncontrolled_failures = tuple(
             uncontrolled_failure
             for uncontrolled_failure in uncontrolled_failures
-            if not isinf(uncontrolled_failure.duration_s)
+            if not isinf(uncontrolled_failure.torque_duration_s)
         )
         yield CheckRow(
             _STOPPING_GROUP,
             f"worst, {_LOOP_FAILS_LABEL}",
             "without bound: the profile accepts a drive without a watchdog",
-            bound_text,
+            margin_text,
             CheckResult.WARNING,
             f"Travel {_LOOP_FAILS_LABEL}: nothing but the wired stop ends it "
             '(cia402.accept_without = ["watchdog"]).',
             STOPPING_LOOP_FAILS_ROW,
         )
     has_speed_limit = drive_settings.max_speed_rad_s > 0
-    highest_rad_s = drive_settings.max_speed_rad_s if has_speed_limit else inf
-    travels = [
-        max_stopping_distance(rig, limits, uncontrolled_failure.duration_s, highest_rad_s)
+    highest_speed_rad_s = drive_settings.max_speed_rad_s if has_speed_limit else inf
+    stopping_distances = [
+        max_stopping_distance(
+            rig, limits, uncontrolled_failure.torque_duration_s, highest_speed_rad_s
+        )
         for uncontrolled_failure in uncontrolled_failures
     ]
-    longest_index = max(
+    worst_index = max(
         range(len(uncontrolled_failures)),
-        key=lambda failure_index: travels[failure_index].total_rad,
+        profile_key=lambda failure_index: stopping_distances[failure_index].total_distance_rad,
     )
-    for failure_index, (uncontrolled_failure, stopping_travel) in enumerate(
-        zip(uncontrolled_failures, travels, strict=True)
+    for failure_index, (uncontrolled_failure, stopping_distance) in enumerate(
+        zip(uncontrolled_failures, stopping_distances, strict=True)
     ):
-        exceeds_margin = not stopping_travel.total_rad <= margin_rad
+        exceeds_margin = not stopping_distance.total_distance_rad <= stopping_margin_rad
         detail_text = ""
-        if failure_index == longest_index:
-            unlimited_failures = max_stopping_distance(rig, limits, uncontrolled_failure.duration_s)
+        if failure_index == worst_index:
+            distance_without_limit = max_stopping_distance(
+                rig, limits, uncontrolled_failure.torque_duration_s
+            )
             detail_text = (
-                "" if has_no_bound else f"Travel: the worst is {uncontrolled_failure.condition}. "
+                ""
+                if has_no_watchdog
+                else f"Travel: the worst is {uncontrolled_failure.condition}. "
             )
             detail_text += (
                 "It relies on the drive's own speed limit of "
                 f"{drive_settings.max_speed_rad_s:g} rad/s "
                 "(object 6080); without it, it would be "
-                f"{_format_angle(unlimited_failures.total_rad)}."
+                f"{_format_angle(distance_without_limit.total_distance_rad)}."
                 if has_speed_limit
                 else "The drive's own speed limit (object 6080) is not set; "
                 "cia402.max_speed_rad_s shortens it."
             )
         if exceeds_margin:
             detail_text += (
-                f" Travel {uncontrolled_failure.condition}: lower {uncontrolled_failure.key}, "
+                f" Travel {uncontrolled_failure.condition}: lower "
+                f"{uncontrolled_failure.profile_key}, "
                 "cia402.max_speed_rad_s, "
                 "limits.velocity_rad_s or limits.angle_rad."
             )
-        worst_failure = "worst, " if failure_index == longest_index and not has_no_bound else ""
+        worst_prefix = "worst, " if failure_index == worst_index and not has_no_watchdog else ""
         yield CheckRow(
             _STOPPING_GROUP,
-            f"{worst_failure}{uncontrolled_failure.condition}",
-            f"{_format_angle(stopping_travel.total_rad)}: "
-            f"{_format_angle(stopping_travel.driven_rad)} in the "
-            f"{uncontrolled_failure.duration_s * 1e3:g} ms {uncontrolled_failure.ended_by}, "
-            f"{_format_angle(stopping_travel.coasting_rad)} coasting",
-            bound_text,
+            f"{worst_prefix}{uncontrolled_failure.condition}",
+            f"{_format_angle(stopping_distance.total_distance_rad)}: "
+            f"{_format_angle(stopping_distance.driven_distance_rad)} in the "
+            f"{uncontrolled_failure.torque_duration_s * 1e3:g} ms "
+            f"{uncontrolled_failure.torque_end_text}, "
+            f"{_format_angle(stopping_distance.coasting_distance_rad)} coasting",
+            margin_text,
             grade(fail=exceeds_margin),
             detail_text.strip(),
             uncontrolled_failure.name,

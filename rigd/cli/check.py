@@ -13,7 +13,7 @@ from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, AsJson, ProfileName, f
 from rigd.runtime import raise_on_signals
 
 if TYPE_CHECKING:
-    from rigd.bench import Results
+    from rigd.bench import BenchResults
     from rigd.check_rows import CheckRow
     from rigd.profile import Profile
 
@@ -79,14 +79,16 @@ def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, eds_only: bool
         typer.echo(json.dumps(json_document, ensure_ascii=False))
     else:
         from rigd.check_rows import CheckResult
-        from rigd.checks import ACCEPTABLE
-        from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, print_table
+        from rigd.checks import ACCEPTABLE_ROW_NAMES
+        from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, print_check_table
 
-        print_table(check_rows, EDS_CONSEQUENCES if eds_only else RIG_CONSEQUENCES)
+        print_check_table(check_rows, EDS_CONSEQUENCES if eds_only else RIG_CONSEQUENCES)
         failed_names = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}
-        if failed_names and failed_names.issubset(ACCEPTABLE) and not eds_only:
+        if failed_names and failed_names.issubset(ACCEPTABLE_ROW_NAMES) and not eds_only:
             accepted_rows = " ".join(
-                f"--accept {row_name}" for row_name in ACCEPTABLE if row_name in failed_names
+                f"--accept {row_name}"
+                for row_name in ACCEPTABLE_ROW_NAMES
+                if row_name in failed_names
             )
             typer.echo(f"To accept that for one session: rigd run … {accepted_rows}")
     if verdict == "failed":
@@ -167,7 +169,9 @@ def bench(
             typer.echo("\n".join(report_lines(results)))
 
 
-def _run_bench(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) -> "Results":
+def _run_bench(
+    profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float
+) -> "BenchResults":
     """Run the series of latency measurements with progress on standard error."""
     from rich.console import Console
     from rich.status import Status
@@ -190,6 +194,10 @@ def _run_bench(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: f
             )
 
         bench = Bench(
-            profile, rate_hz=rate_hz, seconds=seconds, spin_us=spin_us, on_progress=on_progress
+            profile,
+            rate_hz=rate_hz,
+            measurement_duration_s=seconds,
+            spin_us=spin_us,
+            on_progress=on_progress,
         )
         return bench.run()

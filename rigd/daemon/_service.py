@@ -567,7 +567,7 @@ class Service:
                 self._rig,
                 series.stop,
                 series_reporter,
-                live=self._live,
+                with_live_view=self._live,
                 can_receive_stop=self._can_receive_stop,
                 quick_looks=self._quick_looks,
             )

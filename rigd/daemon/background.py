@@ -146,7 +146,7 @@ class PlanJob:
         notes = request.notes.as_metadata()
         try:
             profile = with_specimen(self.profile, notes.get("specimen", ""))
-            run_offline_checks(profile, request.accept).require()
+            run_offline_checks(profile, request.accept).require_passed()
             profile = with_tip_slope(profile, request.tip_slope_rad)
             return Series(
                 profile,

@@ -142,7 +142,7 @@ def run_in_foreground(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
             specimen = notes.get("specimen", "")
-            run_offline_checks(with_specimen(profile, specimen), accept).require()
+            run_offline_checks(with_specimen(profile, specimen), accept).require_passed()
             if prepare is not None:
                 profile = prepare(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
@@ -176,7 +176,9 @@ def run_in_foreground(
             if not (stop.requested or rig.connected):
                 rig.connect(target)
             with _TerminalProgress(session_series.ticks, repeat, print_line) as operator:
-                session_series.run(rig, stop, operator, live=live, quick_looks=quick_looks)
+                session_series.run(
+                    rig, stop, operator, with_live_view=live, quick_looks=quick_looks
+                )
         if stop.requested:
             _print_stop(results, repeat)
         if quick_looks is not None:

@@ -145,7 +145,7 @@ class Series:
         stop: StopRequest,
         listener: SeriesListener,
         *,
-        live: bool,
+        with_live_view: bool,
         can_receive_stop: Callable[[], bool] = can_always_receive_stop,
         quick_looks: QuickLookQueue | None = None,
     ) -> None:
@@ -213,10 +213,10 @@ class Series:
                 self._touch,
                 self._watch_fit,
                 self._session_seed(session_number),
-                self.plan.clearance.accepted,
+                self.plan.offline_check_result.accepted,
             )
             with contextlib.nullcontext() if quick_looks is None else quick_looks.suspended():
-                if live:
+                if with_live_view:
                     listener.on_live_view(rig.show(session_order, stop))
                 run_result = rig.run(session_order, stop, listener.on_progress, can_receive_stop)
             self.results.append(run_result)

@@ -90,7 +90,7 @@ class SessionPlan:
     """Reasons to refuse the session, one line for each; empty if the session is allowed."""
     ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion that the control process makes after the record, such as the return to the start."""
-    clearance: OfflineCheckResult = field(default_factory=OfflineCheckResult)
+    offline_check_result: OfflineCheckResult = field(default_factory=OfflineCheckResult)
     """Results of the checks on the profile that need no device."""
 
 
@@ -263,7 +263,7 @@ def plan_session(
         As `predict_session` does.
     """
     plan = predict_session(profile, excitation, force=force, accept=accept)
-    plan.clearance.require()
+    plan.offline_check_result.require_passed()
     if plan.refused:
         raise RefusedError(plan.refused)
     return plan
@@ -340,7 +340,7 @@ def predict_session(
         ending=_motion_after_record(
             closed_loop, stays=excitation.stays, damped=profile.is_loop_modelled
         ),
-        clearance=offline_check,
+        offline_check_result=offline_check,
     )
 
 
@@ -457,7 +457,9 @@ def plan_document(profile: Profile, excitation: Excitation, plan: SessionPlan) -
             "tip_slope_rad": profile.limits.tip_slope_rad,
         },
         "refused": plan.refused or None,
-        "failed_checks": [asdict(failed_check) for failed_check in plan.clearance.failed],
+        "failed_checks": [
+            asdict(failed_check) for failed_check in plan.offline_check_result.failed
+        ],
         "tip_in_words": plan.tip_in_words,
         "beam": asdict(profile.rig.beam),
         "damping": asdict(profile.rig.damping),

@@ -59,9 +59,9 @@ def computer(monkeypatch, measured, cyclictest):
             self.ran = []
             self.profiles = []
 
-        def loop(self, name, profile, seconds, poll, *, live=False):
+        def loop(self, name, profile, seconds, poll, *, with_live_view=False):
             rate_hz = profile.rig.rate_hz
-            self.ran.append((name, rate_hz, live))
+            self.ran.append((name, rate_hz, with_live_view))
             self.profiles.append(profile)
             poll()
             holds = rate_hz <= self.holds_hz
@@ -71,9 +71,9 @@ def computer(monkeypatch, measured, cyclictest):
             return measured(name, rate_hz=rate_hz, held=1.0 if holds else 0.9)
 
     made = Computer()
-    monkeypatch.setattr("rigd.bench._program.loops.run_alone", made.loop)
+    monkeypatch.setattr("rigd.bench._program.loops.run_without_recorder", made.loop)
     monkeypatch.setattr("rigd.bench._program.loops.run_session", made.loop)
-    monkeypatch.setattr("rigd.bench._program.settings_granted", lambda _: made.granted)
+    monkeypatch.setattr("rigd.bench._program.granted_realtime_settings", lambda _: made.granted)
     return made
 
 
@@ -85,7 +85,7 @@ def bench(computer):
         program = Bench(
             load_profile("sim"),
             rate_hz=rate_hz,
-            seconds=10.0,
+            measurement_duration_s=10.0,
             spin_us=0.0,
             on_progress=lambda step, left_s: progress.append((step, left_s)),
         )

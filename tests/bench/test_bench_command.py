@@ -5,7 +5,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from rigd.bench import Results
+from rigd.bench import BenchResults
 from rigd.cli.app import app
 from rigd.errors import FailureError
 from rigd.runtime.locks import RigLock
@@ -26,10 +26,10 @@ def bench(monkeypatch, measured):
         def run(self):
             if self.fails:
                 raise FailureError(self.fails)
-            results = Results("sim", 1000.0, 1.0, 0.0, {"cpu": "0"}, (0.5, 0.4, 0.3))
+            results = BenchResults("sim", 1000.0, 1.0, 0.0, {"cpu": "0"}, (0.5, 0.4, 0.3))
             results.rounds.append((measured(), None))
-            results.sessions.append(measured())
-            results.search.append(measured())
+            results.session_measurements.append(measured())
+            results.search_measurements.append(measured())
             return results
 
     monkeypatch.setattr("rigd.bench.Bench", FakeBench)
@@ -48,7 +48,11 @@ def test_the_report_ends_with_a_verdict(bench):
     assert done.stdout.splitlines()[-1].startswith("Simulated devices: this computer held 1000 Hz")
     ((name, options),) = bench.calls
     assert name == "sim"
-    assert (options["rate_hz"], options["seconds"], options["spin_us"]) == (2000.0, 5.0, 50.0)
+    assert (options["rate_hz"], options["measurement_duration_s"], options["spin_us"]) == (
+        2000.0,
+        5.0,
+        50.0,
+    )
 
 
 def test_standard_output_is_only_the_document(bench):

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.bench import Results, as_json, report_lines
+from rigd.bench import BenchResults, as_json, report_lines
 from rigd.bench.measure import (
     LoopMeasurement,
     UsageMeter,
+    measurement_from_samples,
     percentiles,
     pool_measurements,
     process_usage,
-    record_measurement,
-    wake_ups_us,
+    wake_up_latencies_us,
 )
 from rigd.engine.shared_state import Phase
 from rigd.session.layout import SAMPLE_DTYPE
@@ -31,24 +31,24 @@ def samples(ticks, lateness_ns, work_ns=1000):
 
 
 def test_latency_of_a_wake_up_includes_missed_ticks():
-    late_us = wake_ups_us(samples([0, 1, 5, 6], [10_000, 20_000, 300_000, 0]), 1000.0)
+    late_us = wake_up_latencies_us(samples([0, 1, 5, 6], [10_000, 20_000, 300_000, 0]), 1000.0)
     np.testing.assert_allclose(late_us, [10.0, 20.0, 3300.0, 0.0])
 
 
 def test_ticks_missed_at_the_start_count():
-    np.testing.assert_allclose(wake_ups_us(samples([2], [5000]), 2000.0), [1005.0])
+    np.testing.assert_allclose(wake_up_latencies_us(samples([2], [5000]), 2000.0), [1005.0])
 
 
 def test_scheduled_ticks_are_recorded_or_missed():
-    found = record_measurement(
+    found = measurement_from_samples(
         "a", 1000.0, samples([0, 1, 5], 0), scheduled_ticks=10, cpu_percent=None, page_faults=None
     )
-    assert (found.missed, found.held) == (7, pytest.approx(0.3))
+    assert (found.missed, found.held_fraction) == (7, pytest.approx(0.3))
 
 
 def test_ticks_missed_in_a_stall_are_counted_separately():
     ticks = [0, 1, 32, 33, 35, 36]
-    found = record_measurement(
+    found = measurement_from_samples(
         "a",
         1000.0,
         samples(ticks, [0, 0, 500_000, 0, 900_000, 0]),
@@ -56,10 +56,10 @@ def test_ticks_missed_in_a_stall_are_counted_separately():
         cpu_percent=None,
         page_faults=None,
     )
-    assert (found.missed, found.stalls) == (31, 1)
-    assert found.held == pytest.approx(6 / 37)
+    assert (found.missed, found.stall_count) == (31, 1)
+    assert found.held_fraction == pytest.approx(6 / 37)
     # The stall swallowed 30 ticks, the wake-up that was 1.9 ms late another one.
-    assert found.held_between_stalls == pytest.approx(6 / 7)
+    assert found.held_fraction_between_stalls == pytest.approx(6 / 7)
 
 
 def test_percentiles_are_numpys():
@@ -78,9 +78,9 @@ def results_of(*measurements):
     """Return results with one round for each measurement, which is also its cyclictest."""
     rounds = [(one, replace(one, name="cyclictest")) for one in measurements]
     first = measurements[0]
-    made = Results("sim", 1000.0, 1.0, 0.0, {"cpu": "0"}, (0.5, 0.4, 0.3), rounds=rounds)
-    made.sessions.append(first)
-    made.search.append(first)
+    made = BenchResults("sim", 1000.0, 1.0, 0.0, {"cpu": "0"}, (0.5, 0.4, 0.3), rounds=rounds)
+    made.session_measurements.append(first)
+    made.search_measurements.append(first)
     return made
 
 
@@ -126,18 +126,18 @@ def test_process_usage_with_special_characters_in_the_name(tmp_path):
 
 def test_usage_is_that_of_the_running_record():
     meter = UsageMeter(os.getpid())
-    meter.sample(Phase.TARING)
+    meter.sample_usage(Phase.TARING)
     assert meter.cpu_percent is None
-    meter.sample(Phase.RUNNING)
+    meter.sample_usage(Phase.RUNNING)
     assert (meter.cpu_percent, meter.page_faults) == (None, None)
     with mmap.mmap(-1, 16 << 20) as fresh:  # from the system, not from what was freed before
         fresh[:: 1 << 12] = bytes(len(fresh) >> 12)
-    meter.sample(Phase.RUNNING)
+    meter.sample_usage(Phase.RUNNING)
     faults = meter.page_faults
     assert meter.cpu_percent is not None
     assert meter.cpu_percent > 0.0
     assert faults > 0
-    meter.sample(Phase.RETURNING)
+    meter.sample_usage(Phase.RETURNING)
     assert meter.page_faults == faults
 
 
@@ -146,5 +146,5 @@ def test_no_usage_of_an_ended_process(monkeypatch):
         "rigd.bench.measure.process_usage", lambda pid: process_usage(pid, Path("/nowhere"))
     )
     meter = UsageMeter(1)
-    meter.sample(Phase.RUNNING)
+    meter.sample_usage(Phase.RUNNING)
     assert meter.cpu_percent is None

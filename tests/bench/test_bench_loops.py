@@ -38,7 +38,7 @@ def raised_priority():
 def test_loop_alone_is_measured_without_a_file(profile):
     polls = []
     before = raised_priority()
-    assert_accounted(loops.run_alone("alone", profile, SECONDS, lambda: polls.append(1)))
+    assert_accounted(loops.run_without_recorder("alone", profile, SECONDS, lambda: polls.append(1)))
     assert polls
     assert raised_priority() == before
 
@@ -55,7 +55,7 @@ def test_failure_of_a_loop_is_reported(profile, monkeypatch):
 
     monkeypatch.setattr("rigd.bench._loops.ProcessGroup", no_memory)
     with pytest.raises(loops.LoopError, match="no shared memory"):
-        loops.run_alone("alone", profile, SECONDS, lambda: None)
+        loops.run_without_recorder("alone", profile, SECONDS, lambda: None)
 
 
 def test_incomplete_session_is_no_measurement(profile, monkeypatch):

@@ -17,13 +17,13 @@ def test_loop_and_cyclictest_alternate(bench, computer):
     assert steps == ["loop alone", "cyclictest"] * 3
     assert [name for name, *_ in computer.ran[:3]] == ["loop alone"] * 3
     assert len(results.rounds) == 3
-    assert results.ratios() == (3.0, 3.0)
-    assert results.alone.scheduled == 3000
+    assert results.latency_ratios() == (3.0, 3.0)
+    assert results.pooled_loop_measurement.scheduled == 3000
 
 
 def test_order_of_the_sessions(bench):
     results = bench()
-    names = [one.name for one in results.sessions]
+    names = [one.name for one in results.session_measurements]
     assert names == ["with recorder", "with recorder and live view", "… and load on other cores"]
 
 
@@ -32,14 +32,14 @@ def test_search_for_the_highest_rate_goes_upwards(bench, computer, holds_hz):
     computer.holds_hz = holds_hz
     results = bench()
     assert results.highest_rate_hz == holds_hz
-    assert [one.rate_hz for one in results.search][-1] == 2 * holds_hz
+    assert [one.rate_hz for one in results.search_measurements][-1] == 2 * holds_hz
     assert f"held {holds_hz:g} Hz" in "\n".join(report_lines(results))
 
 
 def test_lower_rates_are_tried_if_the_first_fails(bench, computer):
     computer.holds_hz = 300.0
     results = bench()
-    assert [one.rate_hz for one in results.search] == [1000.0, 500.0, 250.0]
+    assert [one.rate_hz for one in results.search_measurements] == [1000.0, 500.0, 250.0]
     assert results.highest_rate_hz == 250.0
 
 
@@ -49,7 +49,7 @@ def test_failed_rate_is_tried_again(bench, computer):
 
 
 def test_search_continues_after_stalls_and_reports_them(bench, computer, measured, monkeypatch):
-    def stalling(name, profile, seconds, poll, *, live=False):
+    def stalling(name, profile, seconds, poll, *, with_live_view=False):
         rate_hz = profile.rig.rate_hz
         found = measured(name, rate_hz=rate_hz, held=1.0 if rate_hz <= 2000.0 else 0.9)
         found.lateness_us[0] = 30_010.0
@@ -67,7 +67,7 @@ def test_search_ends_if_no_rate_holds(bench, computer):
     computer.holds_hz = 0.0
     results = bench()
     assert results.highest_rate_hz is None
-    assert results.search[-1].rate_hz >= 100.0
+    assert results.search_measurements[-1].rate_hz >= 100.0
     assert "held none" in "\n".join(report_lines(results))
 
 
@@ -90,8 +90,8 @@ def test_measurement_without_cyclictest(bench, cyclictest, monkeypatch, installe
     if not installed:
         monkeypatch.setenv("PATH", "/nowhere")
     results = bench()
-    assert results.peer is None
-    assert results.ratios() is None
+    assert results.cyclictest_measurement is None
+    assert results.latency_ratios() is None
     text = "\n".join(report_lines(results))
     assert ("it is gone" if installed else "rt-tests") in text
     assert as_json(results)["ratio_to_cyclictest"] is None
@@ -145,7 +145,11 @@ def test_cores_without_the_loop(monkeypatch):
 @pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])
 def test_no_profile_uses_its_hardware(computer, name):
     Bench(
-        load_profile(name), rate_hz=2000.0, seconds=10.0, spin_us=50.0, on_progress=lambda *_: None
+        load_profile(name),
+        rate_hz=2000.0,
+        measurement_duration_s=10.0,
+        spin_us=50.0,
+        on_progress=lambda *_: None,
     ).run()
     assert computer.profiles[0].rig.rate_hz == 2000.0
     for profile in computer.profiles:

@@ -53,8 +53,8 @@ def test_delays_of_whole_periods_count_as_missed_ticks(bench, cyclictest):
 def test_output_without_a_histogram_is_an_error(bench, cyclictest, output):
     cyclictest.output.write_text(output)
     results = bench()
-    assert results.peer is None
-    assert "no histogram" in results.no_peer
+    assert results.cyclictest_measurement is None
+    assert "no histogram" in results.missing_cyclictest_reason
 
 
 def test_options_equal_those_of_the_loop(bench, cyclictest):
@@ -73,7 +73,7 @@ def test_ordinary_scheduling_without_a_priority(bench, computer, cyclictest):
 
 def test_error_of_cyclictest_is_reported(bench, cyclictest):
     cyclictest.errors.write_text("first\nFATAL: not permitted\n")
-    assert bench().no_peer == "FATAL: not permitted"
+    assert bench().missing_cyclictest_reason == "FATAL: not permitted"
 
 
 def test_timeout_of_cyclictest(bench, cyclictest, monkeypatch):
@@ -81,4 +81,4 @@ def test_timeout_of_cyclictest(bench, cyclictest, monkeypatch):
     monkeypatch.setattr(
         "rigd.bench._cyclictest._TIMEOUT_MARGIN_S", -9.9
     )  # the measurement takes 10 s
-    assert "timed out" in bench().no_peer
+    assert "timed out" in bench().missing_cyclictest_reason

@@ -153,7 +153,7 @@ def stand_ins(monkeypatch):
     made = StandIns()
     monkeypatch.setattr("rigd.checks.devices.open_devices", made.open)
     monkeypatch.setattr("rigd.devices._fault_reset.open_devices", made.open)
-    monkeypatch.setattr("rigd.checks.devices.EXCHANGE_TICKS", 100)
+    monkeypatch.setattr("rigd.checks.devices.EXCHANGE_CHECK_TICKS", 100)
     return made
 
 

@@ -41,7 +41,7 @@ def profile(request, can_profile, serial_profile):
 def test_a_fault_is_found_and_not_reset(profile, monkeypatch):
     from rigd.sim.wire import inject
 
-    monkeypatch.setattr("rigd.checks.devices.EXCHANGE_TICKS", 100)
+    monkeypatch.setattr("rigd.checks.devices.EXCHANGE_CHECK_TICKS", 100)
     rows = inspect_devices(profile)
     assert overall(rows) == "ok", rows
     found = {(row.group, row.what): row.found for row in rows}

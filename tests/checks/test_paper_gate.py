@@ -120,7 +120,7 @@ def test_only_accepted_rows_pass(wrong_value, tmp_path):
     assert "(travel_no_angle)" not in left
     assert not refusal(profile, tmp_path, "hold", accept=rows)
     series = Series(profile, hold(rate_hz=1000.0), tmp_path, accept=rows)
-    assert [each.name for each in series.plan.clearance.accepted] == rows
+    assert [each.name for each in series.plan.offline_check_result.accepted] == rows
     # Nothing else is accepted with it.
     assert "limits.velocity_rad_s" in refusal(
         profile, tmp_path, "chirp", accept=rows, amplitude_rad=0.2

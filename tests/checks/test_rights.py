@@ -63,7 +63,7 @@ def test_the_lines_to_grant_missing_rights_are_printed(settings, monkeypatch):
         "scheduling": "refused: not permitted",
         "supervision": "nice -10 (SCHED_RR refused: not permitted)",
     }
-    monkeypatch.setattr("rigd.checks.machine.settings_granted", lambda settings: granted)
+    monkeypatch.setattr("rigd.checks.machine.granted_realtime_settings", lambda settings: granted)
     rows = {row.what: row for row in rights_rows(settings)}
     user = pwd.getpwuid(os.geteuid()).pw_name
     assert f"{user} - memlock unlimited" in rows["memory"].detail
@@ -76,7 +76,7 @@ def test_the_lines_to_grant_missing_rights_are_printed(settings, monkeypatch):
 
 def test_memory_locked_in_part_is_a_warning(settings, monkeypatch):
     granted = {"memory": "locked, except for memory that is allocated later (limit of 8 MB)"}
-    monkeypatch.setattr("rigd.checks.machine.settings_granted", lambda settings: granted)
+    monkeypatch.setattr("rigd.checks.machine.granted_realtime_settings", lambda settings: granted)
     (row,) = rights_rows(settings)
     assert row.verdict is CheckResult.WARNING
     assert "memlock unlimited" in row.detail

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.bench.measure import record_measurement
+from rigd.bench.measure import measurement_from_samples
 from rigd.live import Viewer
 from rigd.live._program import RerunProgram
 from rigd.live.address import LiveAddress, running
@@ -165,13 +165,13 @@ def run(name: str, seconds: float) -> Outcome:
         (path,) = Path(folder).glob("*.mcap")
         samples = read_session(path).samples
     scheduled = round(seconds * RATE_HZ)
-    found = record_measurement(
+    found = measurement_from_samples(
         name, RATE_HZ, samples, scheduled_ticks=scheduled, cpu_percent=None, page_faults=None
     )
     return Outcome(
         name,
         missed=found.missed,
-        missed_between_stalls=round((1.0 - found.held_between_stalls) * scheduled),
+        missed_between_stalls=round((1.0 - found.held_fraction_between_stalls) * scheduled),
         lost=scheduled - found.missed - len(samples),
         recorded=len(samples),
         publisher_mb=publisher_mb,

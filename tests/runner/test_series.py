@@ -61,7 +61,7 @@ def test_series_ends_with_the_first_failed_session(make_series):
     series = make_series(repeat=4, notes={"operator": "Ada", "note": ""})
     bad = replace(COMPLETE, outcome="fault")
     rig, listener = Rig(COMPLETE, bad), RecordingListener()
-    series.run(rig, StopRequest(), listener, live=True)
+    series.run(rig, StopRequest(), listener, with_live_view=True)
     assert series.results == [COMPLETE, bad]
     assert [dict(order.notes) for order in rig.orders] == [
         {"operator": "Ada", "series": "1 of 4"},
@@ -80,7 +80,7 @@ def test_series_ends_with_the_first_failed_session(make_series):
 @pytest.mark.process
 def test_single_session_is_not_numbered(make_series):
     rig = Rig(COMPLETE)
-    make_series().run(rig, StopRequest(), RecordingListener(), live=False)
+    make_series().run(rig, StopRequest(), RecordingListener(), with_live_view=False)
     (order,) = rig.orders
     assert order.notes == ()
     assert dict(order.predicted_metadata)["limit_angle_rad"] == "1.57"
@@ -93,7 +93,7 @@ def test_single_session_is_not_numbered(make_series):
 def test_seeds_of_a_series_follow_from_the_stated_seed(make_series):
     def seeds():
         rig = Rig(*[COMPLETE] * 3)
-        make_series(repeat=3).run(rig, StopRequest(), RecordingListener(), live=False)
+        make_series(repeat=3).run(rig, StopRequest(), RecordingListener(), with_live_view=False)
         return [order.seed for order in rig.orders]
 
     assert seeds()[0] == 1
@@ -110,7 +110,7 @@ def test_no_shipped_profile_states_a_seed():
 def test_no_session_begins_after_a_stop(make_series):
     stop, listener = StopRequest(), RecordingListener()
     stop.request()
-    make_series(repeat=2).run(Rig(), stop, listener, live=False)
+    make_series(repeat=2).run(Rig(), stop, listener, with_live_view=False)
     assert listener.calls == []
 
 
@@ -125,7 +125,9 @@ def test_full_disk_retains_the_results_so_far(make_series, tmp_path):
             return super().run(*order)
 
     with pytest.raises(NoRoomError, match="cannot be created"):
-        series.run(RigWithFullDisk(COMPLETE), StopRequest(), RecordingListener(), live=False)
+        series.run(
+            RigWithFullDisk(COMPLETE), StopRequest(), RecordingListener(), with_live_view=False
+        )
     assert series.results == [COMPLETE]
 
 
@@ -170,7 +172,11 @@ def test_quick_look_is_suspended_during_a_session(make_series):
     queue = FakeQuickLookQueue(listener.calls)
     series = make_series(repeat=3)
     series.run(
-        WatchedRig(*results, stopped), StopRequest(), listener, live=False, quick_looks=queue
+        WatchedRig(*results, stopped),
+        StopRequest(),
+        listener,
+        with_live_view=False,
+        quick_looks=queue,
     )
     session = ["held", "run", "let go", "on_result"]
     pause = ["look", "watch", "watch", "watch"]
@@ -191,7 +197,9 @@ def test_stop_ends_the_wait_for_a_quick_look(make_series):
 
     queue = FakeQuickLookQueue(listener.calls)
     result = replace(COMPLETE, path=Path("a-01.mcap"))
-    make_series(repeat=3).run(StoppingRig(result), stop, listener, live=False, quick_looks=queue)
+    make_series(repeat=3).run(
+        StoppingRig(result), stop, listener, with_live_view=False, quick_looks=queue
+    )
     names = [each if isinstance(each, str) else each[0] for each in listener.calls]
     assert names == ["on_start", "held", "let go", "on_result", "look", "watch"]
 
@@ -202,7 +210,7 @@ def test_no_quick_look_after_a_move(tmp_path):
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
     recorded, queue = replace(COMPLETE, path=Path("a.mcap")), FakeQuickLookQueue(listener.calls)
     series = Series(profile, replace(excitation, stays=True), tmp_path / "out")
-    series.run(Rig(recorded), StopRequest(), listener, live=False, quick_looks=queue)
+    series.run(Rig(recorded), StopRequest(), listener, with_live_view=False, quick_looks=queue)
     assert listener.calls[-2:] == ["let go", ("on_result", recorded, NO_QUICK_LOOK)]
 
 

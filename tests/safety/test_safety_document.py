@@ -86,7 +86,7 @@ def test_the_document_has_the_travel_of_the_shipped_profiles(name):
     free = max_stopping_distance(
         profile.rig, profile.limits, profile.rig.cia402.heartbeat_timeout_s
     )
-    assert f"{free.total_rad:.2f} rad" in section
+    assert f"{free.total_distance_rad:.2f} rad" in section
 
 
 def test_the_page_shows_the_steps_of_the_document_to_reset_a_fault():

@@ -27,8 +27,8 @@ def with_motor(rig, **changes):
 def test_endless_travel_without_friction(profile):
     rig = with_motor(profile.rig, viscous_nm_s_per_rad=0.0, coulomb_nm=0.0)
     travel = max_stopping_distance(rig, profile.limits, 0.05)
-    assert travel.driven_rad == pytest.approx(4.0 * 0.05 + 0.5 * 450.0 * 0.05**2, rel=1e-6)
-    assert travel.coasting_rad == math.inf
+    assert travel.driven_distance_rad == pytest.approx(4.0 * 0.05 + 0.5 * 450.0 * 0.05**2, rel=1e-6)
+    assert travel.coasting_distance_rad == math.inf
 
 
 def test_coulomb_friction_alone_brakes_evenly(profile):
@@ -36,8 +36,8 @@ def test_coulomb_friction_alone_brakes_evenly(profile):
     travel = max_stopping_distance(rig, profile.limits, 0.05)
     speed_rad_s = 4.0 + 0.8 / 2e-3 * 0.05
     inertia_kg_m2 = 2e-3 + 4.7e-3 * 0.98**3 / 3
-    assert travel.driven_rad == pytest.approx((4.0 + speed_rad_s) / 2 * 0.05, rel=1e-6)
-    assert travel.coasting_rad == pytest.approx(
+    assert travel.driven_distance_rad == pytest.approx((4.0 + speed_rad_s) / 2 * 0.05, rel=1e-6)
+    assert travel.coasting_distance_rad == pytest.approx(
         speed_rad_s**2 * inertia_kg_m2 / (2 * 0.1), rel=1e-3
     )
 
@@ -46,15 +46,15 @@ def test_viscous_friction_alone_brakes_by_its_time_constant(profile):
     rig = with_motor(profile.rig, coulomb_nm=1e-6)
     travel = max_stopping_distance(rig, profile.limits, 0.0)
     inertia_kg_m2 = 2e-3 + 4.7e-3 * 0.98**3 / 3
-    assert travel.driven_rad == 0.0
-    assert travel.coasting_rad == pytest.approx(4.0 * inertia_kg_m2 / 0.02, rel=1e-2)
+    assert travel.driven_distance_rad == 0.0
+    assert travel.coasting_distance_rad == pytest.approx(4.0 * inertia_kg_m2 / 0.02, rel=1e-2)
 
 
 def test_the_speed_limit_of_the_drive_shortens_the_travel(profile):
     free = max_stopping_distance(profile.rig, profile.limits, 0.05)
     limited = max_stopping_distance(profile.rig, profile.limits, 0.05, 5.0)
-    assert limited.driven_rad < 5.0 * 0.05
-    assert limited.total_rad < free.total_rad / 4
+    assert limited.driven_distance_rad < 5.0 * 0.05
+    assert limited.total_distance_rad < free.total_distance_rad / 4
 
 
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
@@ -107,8 +107,10 @@ def test_the_worst_travel_is_of_a_blind_loop(profile, limits, what, key):
     assert [each.verdict for each in others] == [CheckResult.OK] * 3
     # Five rad/s, the drive's own limit, for a second; then it runs out.
     travel = max_stopping_distance(blind.rig, blind.limits, 1.002, 5.0)
-    assert 4.9 < travel.driven_rad < 5.01
-    assert row.found.startswith(f"{travel.total_rad:.2f} rad: {travel.driven_rad:.2f} rad in the")
+    assert 4.9 < travel.driven_distance_rad < 5.01
+    assert row.found.startswith(
+        f"{travel.total_distance_rad:.2f} rad: {travel.driven_distance_rad:.2f} rad in the"
+    )
 
 
 def test_endless_travel_is_reported_at_once(profile):
@@ -121,12 +123,15 @@ def test_endless_travel_is_reported_at_once(profile):
     row = worst_row(blind)
     assert row.verdict is CheckResult.FAIL
     assert row.found.startswith("more than 100 rad: more than 100 rad in the")
-    assert max_stopping_distance(profile.rig, profile.limits, math.inf, 5.0).total_rad == math.inf
+    assert (
+        max_stopping_distance(profile.rig, profile.limits, math.inf, 5.0).total_distance_rad
+        == math.inf
+    )
 
 
 def test_constant_speed_needs_no_steps(profile):
     travel = max_stopping_distance(profile.rig, profile.limits, 10.0, 5.0)
-    assert travel.driven_rad == pytest.approx(50.0, abs=0.02)
+    assert travel.driven_distance_rad == pytest.approx(50.0, abs=0.02)
 
 
 def test_no_bound_for_a_drive_accepted_without_watchdog(profile):

@@ -67,7 +67,7 @@ def rig_on_wire(write_profile, start_simulator, load, tmp_path):
         rigs.append(rig)
         rig.connect()
         try:
-            series.run(rig, stop, messages, live=False)
+            series.run(rig, stop, messages, with_live_view=False)
         finally:
             torques = [json.loads(line) for line in log.read_text("utf-8").splitlines()[:-1]]
             torques = [entry for entry in torques if entry["what"] == "torque"]
@@ -113,7 +113,7 @@ def test_a_rig_within_a_quarter_is_probed_once(rig_on_wire, tmp_path):
         tmp_path / "sessions",
     )
     messages = OperatorMessages()
-    again.run(rig, StopRequest(), messages, live=False)
+    again.run(rig, StopRequest(), messages, with_live_view=False)
     assert messages.texts == []
     assert again.results[0].is_successful
 
