@@ -39,7 +39,7 @@ def before_a_command(
     """Accept the options of ``rigd`` itself; their callbacks have already run."""
 
 
-_SECTIONS: Final = {
+_COMMANDS_BY_SECTION: Final = {
     "Sessions": ("run", "serve", "start", "status", "stop"),
     "Rig": ("check", "tare", "zero", "reset", "live"),
     "Session files": ("list", "info", "replay", "recover"),
@@ -47,7 +47,7 @@ _SECTIONS: Final = {
     "Simulated devices": ("simulate", "inject"),
 }
 """Names of the commands in each section of the help."""
-_OTHERS_TITLE: Final = "Other commands"
+_OTHER_COMMANDS_TITLE: Final = "Other commands"
 """Title of the section of the help with all commands that are not in `_SECTIONS`."""
 
 
@@ -57,23 +57,28 @@ class RigdGroup(TyperGroup):
     # Typer's click is its own in some versions and the package of that name in others.
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
         """Write the list of commands into the help text, in sections."""
-        listed_names = {
-            command_name for command_names in _SECTIONS.values() for command_name in command_names
+        listed_command_names = {
+            command_name
+            for command_names in _COMMANDS_BY_SECTION.values()
+            for command_name in command_names
         }
-        other_names = tuple(
+        other_command_names = tuple(
             command_name
             for command_name in self.list_commands(ctx)
-            if command_name not in listed_names
+            if command_name not in listed_command_names
         )
-        for section_title, command_names in {**_SECTIONS, _OTHERS_TITLE: other_names}.items():
-            known_names = [
+        for section_title, command_names in {
+            **_COMMANDS_BY_SECTION,
+            _OTHER_COMMANDS_TITLE: other_command_names,
+        }.items():
+            known_command_names = [
                 command_name for command_name in command_names if command_name in self.commands
             ]
-            if known_names:
-                name_width = formatter.width - 6 - max(map(len, known_names))
+            if known_command_names:
+                help_text_width = formatter.width - 6 - max(map(len, known_command_names))
                 help_rows = [
-                    (command_name, self.commands[command_name].get_short_help_str(name_width))
-                    for command_name in known_names
+                    (command_name, self.commands[command_name].get_short_help_str(help_text_width))
+                    for command_name in known_command_names
                 ]
                 with formatter.section(section_title):
                     formatter.write_dl(help_rows)

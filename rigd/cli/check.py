@@ -42,34 +42,34 @@ def check(
     """
     _interrupt_on_end_signals()
     if eds is not None:
-        _print_result(_eds_file_rows(eds, profile), as_json=as_json, eds_only=True)
+        _print_result(_eds_file_rows(eds, profile), as_json=as_json, is_eds_only=True)
         return
     rig_profile = _openable_profile("sim" if profile is None else profile)
     from rigd.checks import check_rig
 
-    _print_result(check_rig(rig_profile), as_json=as_json, eds_only=False)
+    _print_result(check_rig(rig_profile), as_json=as_json, is_eds_only=False)
 
 
-def _eds_file_rows(eds: Path, profile: str | None) -> "list[CheckRow]":
+def _eds_file_rows(eds_path: Path, profile_name: str | None) -> "list[CheckRow]":
     """Return the rows of an EDS file's check, by itself or against a profile."""
     from rigd.checks.offline import eds_rows
 
-    if profile is None:
-        return list(eds_rows(eds, None))
-    rig_profile = profile_named(profile)
+    if profile_name is None:
+        return list(eds_rows(eds_path, None))
+    rig_profile = profile_named(profile_name)
     if rig_profile.rig.cia402 is None:
         fail(
             f"{rig_profile.path}: has no section [cia402] to check the file against; "
             "omit --profile, or name a profile with a CiA 402 drive.",
             EXIT_WRONG_USE,
         )
-    return list(eds_rows(eds, rig_profile.rig))
+    return list(eds_rows(eds_path, rig_profile.rig))
 
 
-def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, eds_only: bool) -> None:
+def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, is_eds_only: bool) -> None:
     """Print the rows of a check as a table or JSON, and end with exit code 1 if it failed.
 
-    `eds_only` states that only an EDS file was checked.
+    `is_eds_only` states that only an EDS file was checked.
     """
     from rigd.check_rows import overall
 
@@ -82,15 +82,15 @@ def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, eds_only: bool
         from rigd.checks import ACCEPTABLE_ROW_NAMES
         from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, print_check_table
 
-        print_check_table(check_rows, EDS_CONSEQUENCES if eds_only else RIG_CONSEQUENCES)
-        failed_names = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}
-        if failed_names and failed_names.issubset(ACCEPTABLE_ROW_NAMES) and not eds_only:
-            accepted_rows = " ".join(
+        print_check_table(check_rows, EDS_CONSEQUENCES if is_eds_only else RIG_CONSEQUENCES)
+        failed_row_names = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}
+        if failed_row_names and failed_row_names.issubset(ACCEPTABLE_ROW_NAMES) and not is_eds_only:
+            accept_options = " ".join(
                 f"--accept {row_name}"
                 for row_name in ACCEPTABLE_ROW_NAMES
-                if row_name in failed_names
+                if row_name in failed_row_names
             )
-            typer.echo(f"To accept that for one session: rigd run … {accepted_rows}")
+            typer.echo(f"To accept that for one session: rigd run … {accept_options}")
     if verdict == "failed":
         raise typer.Exit(EXIT_FAILED)
 
@@ -117,11 +117,11 @@ def reset(profile: DaemonProfile = None) -> None:
         fail(str(error), EXIT_FAILED)
 
 
-def _openable_profile(name: str) -> "Profile":
+def _openable_profile(profile_name: str) -> "Profile":
     """Load a profile, and check that this installation can open its devices."""
     from rigd.devices import check_selection
 
-    profile = profile_named(name)
+    profile = profile_named(profile_name)
     check_selection(profile.rig.devices, profile.path)
     return profile
 

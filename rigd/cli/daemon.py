@@ -13,7 +13,7 @@ import typer
 from rigd.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_WRONG_USE,
-    SESSIONS,
+    SESSIONS_FOLDER,
     AsJson,
     Fast,
     Hardware,
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from rigd.daemon.client import Client
 
 
-_UPDATE_PERIOD_S = 0.5
+_STATUS_UPDATE_PERIOD_S = 0.5
 """Interval in seconds at which ``rigd status --watch`` updates the status."""
 
 
 def serve(
     profile: ProfileName,
-    output: Output = SESSIONS,
+    output: Output = SESSIONS_FOLDER,
     group: Annotated[
         str | None,
         typer.Option("--group", help="Also let this group control the daemon, via /run/rigd."),
@@ -259,7 +259,7 @@ def _watch_status(profile: str | None) -> None:
     from rigd.daemon.address import find
     from rigd.daemon.client import Client
 
-    wanted_rig = rig_name(profile)
+    wanted_rig_name = rig_name(profile)
     with (
         daemon_client(profile) as client,
         Live(console=Console(), auto_refresh=False) as live_display,
@@ -267,13 +267,13 @@ def _watch_status(profile: str | None) -> None:
         connected_client: Client | None = client
         while True:
             try:
-                connected_client = connected_client or Client(find(wanted_rig))
+                connected_client = connected_client or Client(find(wanted_rig_name))
                 daemon_reply = connected_client.ask("status")
-                wanted_rig = wanted_rig or daemon_reply["daemon"]["profile"]
+                wanted_rig_name = wanted_rig_name or daemon_reply["daemon"]["profile"]
                 live_display.update(status_table(daemon_reply), refresh=True)
             except RigdError as error:
                 if connected_client is not None:
                     connected_client.close()
                     connected_client = None
                 live_display.update(f"{error} Waiting for it; Ctrl-C quits.", refresh=True)
-            time.sleep(_UPDATE_PERIOD_S)
+            time.sleep(_STATUS_UPDATE_PERIOD_S)

@@ -9,7 +9,7 @@ import typer
 from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
-    SESSIONS,
+    SESSIONS_FOLDER,
     AsJson,
     Fast,
     Hardware,
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from rigd.identification.estimate import MotorEstimate
     from rigd.profile import Profile
 
-    Session = Callable[..., Excitation]
-    Prepare = Callable[[Profile], Profile]
+    SessionBuilder = Callable[..., Excitation]
+    PrepareProfile = Callable[[Profile], Profile]
 
 identify_app = typer.Typer(
     cls=SessionCommands,
@@ -55,7 +55,7 @@ def identify() -> None:
 @identify_app.command()
 def motor(
     profile: ProfileName = "sim",
-    output: Output = SESSIONS,
+    output: Output = SESSIONS_FOLDER,
     torque_percent: Annotated[
         float,
         typer.Option("--torque-percent", help="Largest predicted torque (% of the rated torque)."),
@@ -135,23 +135,23 @@ def _run_sessions(
     An incomplete session ends the command. The file of the trial is not used for the estimate,
     because the controller is too slow in the trial.
     """
-    stop_request, process_group = start_processes(live=False)
+    stop_request, process_group = start_processes(with_live_view=False)
     from rigd.identification import with_cautious_controller, with_tuned_controller
     from rigd.identification.experiments import multisine_session, speeds_session, trial_session
     from rigd.runner import ProcessGroup, run_in_foreground
     from rigd.runtime import ignore_end_signals
 
-    def run(
-        session_builder: "Session",
-        prepare: "Prepare",
+    def run_numbered_session(
+        session_builder: "SessionBuilder",
+        prepare_profile: "PrepareProfile",
         session_number: int,
         process_group: ProcessGroup,
     ) -> Path:
-        def build(profile: "Profile") -> "Excitation":
+        def build_excitation(profile: "Profile") -> "Excitation":
             return session_builder(profile, torque_percent=torque_percent, stroke_rad=stroke_rad)
 
         session_results = run_in_foreground(
-            build,
+            build_excitation,
             process_group,
             stop_request,
             profile_name=profile_name,
@@ -164,7 +164,7 @@ def _run_sessions(
             force=False,
             quiet_stdout=quiet_stdout,
             hardware=hardware,
-            prepare=prepare,
+            prepare_profile=prepare_profile,
             identifies_motor=True,
         )
         if stop_request.requested and not any(
@@ -177,14 +177,16 @@ def _run_sessions(
         return file_path
 
     try:
-        trial_path = run(trial_session, with_cautious_controller, 0, process_group)
+        trial_path = run_numbered_session(trial_session, with_cautious_controller, 0, process_group)
         motor_estimate = _estimate_motor([trial_path], profile_name)[0]
 
-        def tune(profile: "Profile") -> "Profile":
+        def tune_profile(profile: "Profile") -> "Profile":
             return with_tuned_controller(profile, motor_estimate)
 
         return [
-            run(session_builder, tune, session_number, ProcessGroup(live=False))
+            run_numbered_session(
+                session_builder, tune_profile, session_number, ProcessGroup(live=False)
+            )
             for session_number, session_builder in enumerate(
                 (multisine_session, speeds_session), start=1
             )

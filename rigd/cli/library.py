@@ -11,10 +11,10 @@ import typer
 from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_WRONG_USE,
-    SESSIONS,
+    SESSIONS_FOLDER,
     AsJson,
-    complain,
     fail,
+    print_error,
     progress,
 )
 from rigd.printable import printable, readable_message
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from rigd.library import SessionRow
     from rigd.library.trend import ModeTrend, TrendPoint
 
-_MAX_TEXT_WIDTH: Final = 24
+_MAX_CELL_WIDTH: Final = 24
 """Largest width of a text in a table, in characters."""
 _PLOT_WIDTH: Final = 25
 """Width of the plot of a trend, in characters."""
 _FIRST_SESSION_TEXT: Final = (
-    f"No sessions yet: there is no folder {SESSIONS}. Record one on the simulated rig with "
+    f"No sessions yet: there is no folder {SESSIONS_FOLDER}. Record one on the simulated rig with "
     "rigd run chirp --fast, or list those of another folder with rigd list FOLDER."
 )
 """Text that is printed if the default folder of sessions does not exist."""
@@ -78,7 +78,7 @@ def list_sessions(
 
     rows: list[SessionRow] = []
     if not folders:
-        folders = [SESSIONS] if SESSIONS.exists() else []
+        folders = [SESSIONS_FOLDER] if SESSIONS_FOLDER.exists() else []
     for folder in folders:
         with progress(folder.name) as on_progress:
             rows += sessions_of(
@@ -139,15 +139,18 @@ def _sessions_of_one_specimen(session_rows: "list[SessionRow]") -> "list[Session
     rows_with_modes = [row for row in session_rows if row.modes]
     specimen_names = sorted({row.specimen for row in rows_with_modes})
     if len(specimen_names) > 1:
-        names = ", ".join(
+        specimen_list_text = ", ".join(
             repr(specimen_name) if specimen_name else "none" for specimen_name in specimen_names
         )
-        fail(f"--trend: the sessions are of several specimens ({names}); name one by --specimen.",
-             EXIT_WRONG_USE)  # fmt: skip
+        fail(
+            f"--trend: the sessions are of several specimens ({specimen_list_text}); name one by "
+            "--specimen.",
+            EXIT_WRONG_USE,
+        )
     return rows_with_modes
 
 
-def _local_start(row: "SessionRow") -> str:
+def _local_start_text(row: "SessionRow") -> str:
     """Format the local date and time of a session's start; "" if it is unknown."""
     if row.start_utc_ns is None:
         return ""
@@ -157,20 +160,23 @@ def _local_start(row: "SessionRow") -> str:
         return ""
 
 
-def _table_lines(titles: Sequence[str], table_rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def _table_lines(
+    column_titles: Sequence[str], table_rows: Sequence[Sequence[str]]
+) -> Iterator[str]:
     """Yield the lines of a text table, without the columns whose cells are all empty."""
-    filled_columns = [
+    filled_column_indices = [
         column_index
-        for column_index in range(len(titles))
+        for column_index in range(len(column_titles))
         if any(row[column_index] for row in table_rows)
     ]
     column_widths = {
-        column_index: max(len(row[column_index]) for row in (titles, *table_rows))
-        for column_index in filled_columns
+        column_index: max(len(row[column_index]) for row in (column_titles, *table_rows))
+        for column_index in filled_column_indices
     }
-    for row in (titles, *table_rows):
+    for row in (column_titles, *table_rows):
         yield "  ".join(
-            f"{row[column_index]:{column_widths[column_index]}}" for column_index in filled_columns
+            f"{row[column_index]:{column_widths[column_index]}}"
+            for column_index in filled_column_indices
         ).rstrip()
 
 
@@ -187,10 +193,10 @@ def _session_lines(session_rows: "list[SessionRow]") -> Iterator[str]:
         column_titles,
         [
             (
-                _local_start(row),
+                _local_start_text(row),
                 printable(row.path.name),
                 *(
-                    printable(cell_text, _MAX_TEXT_WIDTH)
+                    printable(cell_text, _MAX_CELL_WIDTH)
                     for cell_text in (row.specimen, row.operator, row.excitation, row.outcome)
                 ),
                 ", ".join(map(_mode_text, row.modes)),
@@ -208,8 +214,8 @@ def _session_lines(session_rows: "list[SessionRow]") -> Iterator[str]:
 
 def _mode_text(mode: "ReportedMode") -> str:
     """Format a mode's frequency and damping ratio; a "?" marks values that an analysis doubts."""
-    flag_mark = "?" if mode.flag else ""
-    return f"{mode.frequency_hz.value:.4g} Hz {100 * mode.damping_ratio.value:.3g} %{flag_mark}"
+    flag_suffix = "?" if mode.flag else ""
+    return f"{mode.frequency_hz.value:.4g} Hz {100 * mode.damping_ratio.value:.3g} %{flag_suffix}"
 
 
 def _validity_text(row: "SessionRow") -> str:
@@ -246,7 +252,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
             ),
             [
                 (
-                    _local_start(trend_point.row),
+                    _local_start_text(trend_point.row),
                     _quantity_text(trend_point.frequency_hz),
                     _change_text(
                         trend_point.frequency_change, mode_trend.points[0].frequency_hz.value
@@ -288,7 +294,7 @@ def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> 
     if highest_hz <= lowest_hz:
         return ""
 
-    def column_of(frequency_hz: float) -> int:
+    def plot_column(frequency_hz: float) -> int:
         return min(
             max(
                 round((frequency_hz - lowest_hz) / (highest_hz - lowest_hz) * (_PLOT_WIDTH - 1)), 0
@@ -298,19 +304,19 @@ def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> 
 
     frequency_value_hz = point.frequency_hz.value
     first_column, last_column = map(
-        column_of, point.frequency_hz.interval_95 or (frequency_value_hz, frequency_value_hz)
+        plot_column, point.frequency_hz.interval_95 or (frequency_value_hz, frequency_value_hz)
     )
     plot_characters = [
         "─" if first_column <= column_index <= last_column else " "
         for column_index in range(_PLOT_WIDTH)
     ]
-    plot_characters[column_of(frequency_value_hz)] = "●"
+    plot_characters[plot_column(frequency_value_hz)] = "●"
     return "".join(plot_characters)
 
 
-def _quantity_text(estimate: "Estimate", scale: float = 1.0) -> str:
+def _quantity_text(estimate: "Estimate", display_factor: float = 1.0) -> str:
     """Format a value with the half-width of its 95 % interval; "?" marks a doubtful one."""
-    return estimate.text(scale) + (" ?" if estimate.flag else "")
+    return estimate.text(display_factor) + (" ?" if estimate.flag else "")
 
 
 def _change_text(change: "Change | None", first_value: float) -> str:
@@ -343,7 +349,7 @@ def info(
             description = describe(file_path)
         except SessionError as error:
             has_failed = True
-            complain(str(error))
+            print_error(str(error))
             json_documents.append({"path": str(file_path), "error": str(error)})
         else:
             json_documents.append(description.as_dict())
@@ -382,7 +388,7 @@ def recover(
                 recovery = recover_file(file_path, on_progress)
         except SessionError as error:
             has_failed = True
-            complain(str(error))
+            print_error(str(error))
             json_documents.append({"source": str(file_path), "path": None, "error": str(error)})
         else:
             json_documents.append(recovery.as_dict())

@@ -87,10 +87,10 @@ def live(
 
     Example: rigd live --profile antenna_can
     """
-    rig = None if profile is None else _rig_name(profile)
-    view = _only_running_view(rig)
+    rig_name = None if profile is None else _rig_name(profile)
+    view = _only_running_view(rig_name)
     if view is None and wait:
-        view = _wait_for_view(rig)
+        view = _wait_for_view(rig_name)
     if view is None:
         fail(_start_advice(profile), EXIT_FAILED)
     if web:
@@ -122,24 +122,24 @@ def _rig_name(profile: str) -> str:
     return profile_named(profile).name
 
 
-def _only_running_view(rig: str | None) -> "LiveAddress | None":
-    """Return the only running live view, of `rig` or of any rig, or None if there is none.
+def _only_running_view(rig_name: str | None) -> "LiveAddress | None":
+    """Return the only running live view, of `rig_name` or of any rig, or None if there is none.
 
     Several live views end the command.
     """
     from rigd.daemon.client import find_views
 
-    views = find_views(rig)
-    if len(views) > 1:
-        rigs = ", ".join(live_view.rig for live_view in views)
-        fail(f"Several live views are running ({rigs}); name one with --profile.", EXIT_FAILED)
-    return views[0] if views else None
+    live_views = find_views(rig_name)
+    if len(live_views) > 1:
+        rig_names = ", ".join(live_view.rig for live_view in live_views)
+        fail(f"Several live views are running ({rig_names}); name one with --profile.", EXIT_FAILED)
+    return live_views[0] if live_views else None
 
 
-def _wait_for_view(rig: str | None) -> "LiveAddress":
+def _wait_for_view(rig_name: str | None) -> "LiveAddress":
     """Wait until a live view runs, and return its address."""
     typer.echo("Waiting for a live view to start; Ctrl-C quits.", err=True)
-    while (live_view := _only_running_view(rig)) is None:
+    while (live_view := _only_running_view(rig_name)) is None:
         time.sleep(_POLL_PERIOD_S)
     return live_view
 
@@ -243,7 +243,7 @@ def replay(
     """
     if save is not None:
         with interrupted_by_end_signals():
-            _save_recording(path, save, web=web)
+            _save_recording(path, save, is_web_requested=web)
         return
     if not web and not has_screen():
         _check_displayable(path)  # the same files are valid for a window and for other outputs
@@ -258,16 +258,16 @@ def replay(
             EXIT_FAILED,
         )
     with interrupted_by_end_signals(), scratch_folder() as scratch_path:
-        recording = _as_recording(path, scratch_path)
+        rerun_path = _as_recording(path, scratch_path)
         if web:
-            _serve_recording(recording, scratch_path, path)
+            _serve_recording(rerun_path, scratch_path, path)
         else:
-            _open_window(recording, scratch_path, path)
+            _open_window(rerun_path, scratch_path, path)
 
 
-def _save_recording(path: Path, out: Path, *, web: bool) -> None:
+def _save_recording(path: Path, output_path: Path, *, is_web_requested: bool) -> None:
     """Convert a session file into a new Rerun file, for the option ``--save``."""
-    if web:
+    if is_web_requested:
         fail(
             "--save writes a file and shows nothing, so it cannot be combined with --web.",
             EXIT_WRONG_USE,
@@ -275,11 +275,11 @@ def _save_recording(path: Path, out: Path, *, web: bool) -> None:
     if path.suffix == SUFFIX:
         fail(f"{path} is a recording for Rerun already; copy it instead.", EXIT_WRONG_USE)
     try:
-        check_new(out)
+        check_new(output_path)
     except RrdFileError as error:
         fail(f"--save {error}", EXIT_WRONG_USE)
-    _write_rerun_file(path, out)
-    typer.echo(f"{out}: open it with rigd replay {out}.", err=True)
+    _write_rerun_file(path, output_path)
+    typer.echo(f"{output_path}: open it with rigd replay {output_path}.", err=True)
 
 
 def _check_displayable(path: Path) -> None:
@@ -292,47 +292,50 @@ def _check_displayable(path: Path) -> None:
         check_magic_bytes(path)
 
 
-def _write_rerun_file(path: Path, out: Path) -> None:
+def _write_rerun_file(session_path: Path, output_path: Path) -> None:
     """Convert a session file into a Rerun file, with a progress line."""
     from rigd.session import read_session, read_timings
     from rigd.view import draw_session
 
-    session, tick_timings = read_session(path), read_timings(path)
-    with progress(path.name) as on_progress, new_rrd_file(out) as recording_stream:
+    session, tick_timings = read_session(session_path), read_timings(session_path)
+    with progress(session_path.name) as on_progress, new_rrd_file(output_path) as recording_stream:
         draw_session(recording_stream, session, tick_timings, on_progress=on_progress)
 
 
-def _as_recording(path: Path, scratch: Path) -> Path:
-    """Return the path of a Rerun file; if `path` is a session file, convert it into `scratch`."""
+def _as_recording(path: Path, scratch_path: Path) -> Path:
+    """Return the path of a Rerun file; convert it into `scratch_path` if `path` is a session."""
     if path.suffix == SUFFIX:
         check_rrd_file(path)
         return path
-    recording = scratch / f"session{SUFFIX}"
-    _write_rerun_file(path, recording)
-    return recording
+    rerun_path = scratch_path / f"session{SUFFIX}"
+    _write_rerun_file(path, rerun_path)
+    return rerun_path
 
 
-def _open_window(recording: Path, scratch: Path, path: Path) -> None:
+def _open_window(rerun_path: Path, scratch_path: Path, shown_path: Path) -> None:
     """Show a Rerun file in a window until the window is closed."""
     from rigd.live import FileWindow
 
-    with FileWindow(recording, scratch) as file_window:
-        typer.echo(f"{path.name} is shown; close the window, or press Ctrl-C, to end.", err=True)
+    with FileWindow(rerun_path, scratch_path) as file_window:
+        typer.echo(
+            f"{shown_path.name} is shown; close the window, or press Ctrl-C, to end.", err=True
+        )
         if file_window.wait():
             fail(
-                f"{file_window.fault} rigd replay {path} --web shows the same in a browser.",
+                f"{file_window.fault} rigd replay {shown_path} --web shows the same in a browser.",
                 EXIT_FAILED,
             )
 
 
-def _serve_recording(recording: Path, scratch: Path, path: Path) -> None:
+def _serve_recording(rerun_path: Path, scratch_path: Path, shown_path: Path) -> None:
     """Show a Rerun file on a page for browsers until Ctrl-C."""
     from rigd.live import PageOfFile
 
-    with PageOfFile(recording, scratch) as page:
+    with PageOfFile(rerun_path, scratch_path) as page:
         typer.echo(page.address.page_url)
         typer.echo(
-            f"{path.name} is shown there until Ctrl-C. {tunnel_advice(page.address)}", err=True
+            f"{shown_path.name} is shown there until Ctrl-C. {tunnel_advice(page.address)}",
+            err=True,
         )
         page.wait()
         fail(f"The Rerun server ended: {page.program.last_log_lines}.", EXIT_FAILED)

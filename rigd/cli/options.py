@@ -21,13 +21,13 @@ EXIT_WRONG_USE = entry.EXIT_WRONG_USE
 EXIT_INTERRUPTED = entry.EXIT_INTERRUPTED
 
 
-def fail(message: str, code: int) -> NoReturn:
+def fail(message: str, exit_code: int) -> NoReturn:
     """Write an error message to standard error, and end the command with an exit code."""
-    complain(message)
-    raise typer.Exit(code)
+    print_error(message)
+    raise typer.Exit(exit_code)
 
 
-def complain(message: str) -> None:
+def print_error(message: str) -> None:
     """Write an error message to standard error."""
     typer.echo(f"Error: {readable_message(message)}", err=True)
 
@@ -62,12 +62,12 @@ def progress(task_name: str) -> Iterator[Callable[[float], None]]:
     with contextlib.ExitStack() as exit_stack:
         show_fraction: Callable[[float], None] | None = None
 
-        def on_progress(fraction: float) -> None:
+        def on_progress(completed_fraction: float) -> None:
             nonlocal show_fraction
             if show_fraction is None and time.monotonic() - start_s > _PROGRESS_DELAY_S:
                 show_fraction = exit_stack.enter_context(_progress_line(task_name))
             if show_fraction is not None:
-                show_fraction(fraction)
+                show_fraction(completed_fraction)
 
         yield on_progress
 
@@ -89,7 +89,7 @@ EdsFile = Annotated[
     Path, typer.Option("--eds", metavar="FILE", help="EDS or DCF file of a CANopen drive.")
 ]
 Output = Annotated[Path, typer.Option("--output", help="Folder for the session files.")]
-SESSIONS = Path("sessions")
+SESSIONS_FOLDER = Path("sessions")
 """Default folder of session files."""
 Seed = Annotated[
     int | None,

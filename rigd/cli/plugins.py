@@ -28,34 +28,37 @@ def plugins(context: typer.Context, as_json: AsJson = False) -> None:
         return
     from rigd.plugins import GROUPS, PluginError, check_plugin, installed_plugins
 
-    rows = []
+    plugin_rows = []
     for group in GROUPS:
         for plugin in installed_plugins(group):
-            summary = problem = ""
+            plugin_summary = plugin_problem = ""
             try:
-                summary = check_plugin(plugin)
+                plugin_summary = check_plugin(plugin)
             except PluginError as error:
-                problem = str(error)
-            rows.append(
+                plugin_problem = str(error)
+            plugin_rows.append(
                 {
                     "group": group,
                     "name": plugin.name,
                     "package": plugin.package,
                     "version": plugin.version,
-                    "summary": summary,
-                    "problem": problem,
+                    "summary": plugin_summary,
+                    "problem": plugin_problem,
                 }
             )
     if as_json:
-        typer.echo(json.dumps({"plugins": rows}, ensure_ascii=False))
-    elif not rows:
+        typer.echo(json.dumps({"plugins": plugin_rows}, ensure_ascii=False))
+    elif not plugin_rows:
         typer.echo(f"No installed package adds anything ({', '.join(GROUPS)}).")
     else:
-        for row in rows:
-            owner = f"{row['package']} {row['version']}"
-            text = row["problem"] or f"{row['name']}: {row['summary']} ({row['group']}, {owner})"
-            typer.echo(printable(f"Cannot be used: {text}" if row["problem"] else text))
-    if any(row["problem"] for row in rows):
+        for row in plugin_rows:
+            package_text = f"{row['package']} {row['version']}"
+            row_text = (
+                row["problem"]
+                or f"{row['name']}: {row['summary']} ({row['group']}, {package_text})"
+            )
+            typer.echo(printable(f"Cannot be used: {row_text}" if row["problem"] else row_text))
+    if any(row["problem"] for row in plugin_rows):
         raise typer.Exit(EXIT_FAILED)
 
 
@@ -79,12 +82,12 @@ def show(
             f"No installed package adds a device or a controller {printable(name, 40)}.",
             EXIT_WRONG_USE,
         )
-    controller = CONTROLLERS[name]
+    controller_kind = CONTROLLERS[name]
     typer.echo(f'# In [control]: controller = "{name}"')
-    typer.echo(section_text(controller), nl=False)
+    typer.echo(section_text(controller_kind), nl=False)
 
 
-_TEMPLATE = Path(__file__).with_name("plugin_template")
+_TEMPLATE_FOLDER = Path(__file__).with_name("plugin_template")
 """Folder with the template of a package, in which NAME represents the name of its part."""
 
 
@@ -97,7 +100,7 @@ class PartKind(StrEnum):
     """Controller of the motor's angle."""
 
 
-_TEMPLATE_WORDS = {
+_TEMPLATE_REPLACEMENTS = {
     PartKind.DEVICE: {
         "TITLE": "Force-torque sensor NAME",
         "GROUP": "rigd.devices",
@@ -137,7 +140,7 @@ def new(
             "characters, that begins with a letter.",
             EXIT_WRONG_USE,
         )
-    if _is_taken(kind, name):
+    if _is_name_taken(kind, name):
         fail(
             f"A {kind.value} {name} exists already (rigd plugins); choose another name.",
             EXIT_WRONG_USE,
@@ -152,13 +155,13 @@ def new(
     try:
         package_folder.mkdir(parents=True)
         for template, path in template_files.items():
-            text = (_TEMPLATE / template).read_text(encoding="utf-8")
+            file_text = (_TEMPLATE_FOLDER / template).read_text(encoding="utf-8")
             if not template.endswith(".py.txt"):
-                for word, replacement in _TEMPLATE_WORDS[kind].items():
-                    text = text.replace(word, replacement)
+                for word, replacement in _TEMPLATE_REPLACEMENTS[kind].items():
+                    file_text = file_text.replace(word, replacement)
             new_file = package_folder / path.replace("NAME", name)
             new_file.parent.mkdir(exist_ok=True)
-            new_file.write_text(text.replace("NAME", name), encoding="utf-8")
+            new_file.write_text(file_text.replace("NAME", name), encoding="utf-8")
     except FileExistsError:
         fail(f"{package_folder} exists already; choose another folder (--folder).", EXIT_WRONG_USE)
     except OSError as error:
@@ -171,7 +174,7 @@ def new(
     )
 
 
-def _is_taken(kind: PartKind, name: str) -> bool:
+def _is_name_taken(kind: PartKind, name: str) -> bool:
     """Return whether rigd or an installed package already has a part of this kind and name."""
     from rigd.control.kinds import CONTROLLERS
     from rigd.devices.kinds import DEVICES

@@ -24,7 +24,7 @@ def probe(
 
     Example: rigd probe --profile sim --fast
     """
-    stop_request, process_group = start_processes(live=False)
+    stop_request, process_group = start_processes(with_live_view=False)
     from rigd.runner import probe_in_foreground
     from rigd.runtime import ignore_end_signals
 

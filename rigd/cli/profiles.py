@@ -148,11 +148,11 @@ def new(
     write_new(output, _ask_for_values(draft) if is_terminal() else draft.profile_text())
     for draft_remark in draft.remarks:
         typer.echo(f"Note: {draft_remark}", err=True)
-    unanswered = draft.unanswered_questions()
+    unanswered_questions = draft.unanswered_questions()
     missing_features = [finding.acceptance_name for finding in draft.unaccepted_findings()]
-    if unanswered or missing_features:
+    if unanswered_questions or missing_features:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
-    for open_question in unanswered:
+    for open_question in unanswered_questions:
         typer.echo(
             f"  {open_question.profile_key} = {draft.value_text(open_question.profile_key)}: "
             f"{open_question.question_text}",
@@ -197,27 +197,27 @@ def _ask_for_values(draft: "Draft") -> str:
 
 def _ask_for_acceptance(draft: "Draft") -> None:
     """Ask the user whether to accept each missing feature of the drive; Enter means no."""
-    declined_names: set[str] = set()
+    declined_features: set[str] = set()
     # One answer may imply another: without a watchdog its reaction is irrelevant.
     while missing_features := [
         finding
         for finding in draft.unaccepted_findings()
-        if finding.acceptance_name not in declined_names
+        if finding.acceptance_name not in declined_features
     ]:
         typer.echo(missing_features[0].consequence, err=True)
         feature_name = missing_features[0].acceptance_name
         if typer.confirm(f"Run it without ({feature_name})?", default=False, err=True):
             draft.accept(feature_name)
         else:
-            declined_names.add(feature_name)
+            declined_features.add(feature_name)
 
 
-def _ask_for_value(draft: "Draft", key: str, text: str) -> None:
+def _ask_for_value(draft: "Draft", profile_key: str, question_text: str) -> None:
     """Ask the user for the value of a key of the profile until the answer is valid."""
     while True:
-        typed_reply = typer.prompt(text, default=draft.value_text(key), err=True)
+        typed_reply = typer.prompt(question_text, default=draft.value_text(profile_key), err=True)
         try:
-            draft.answer(key, typed_reply.strip())
+            draft.answer(profile_key, typed_reply.strip())
             return
         except ValueError as error:
-            typer.echo(f"{key}: {error}.", err=True)
+            typer.echo(f"{profile_key}: {error}.", err=True)

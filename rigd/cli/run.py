@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
-    SESSIONS,
+    SESSIONS_FOLDER,
     Accept,
     AsJson,
     Fast,
@@ -66,10 +66,10 @@ class _AddedExcitations(TyperGroup):
         from rigd.plugins import installed_plugins
 
         super().format_commands(ctx, formatter)
-        added = installed_plugins("rigd.excitations")
-        if added:
+        added_plugins = installed_plugins("rigd.excitations")
+        if added_plugins:
             with formatter.section("Excitations of installed packages (rigd plugins)"):
-                formatter.write_dl([(plugin.name, plugin.label) for plugin in added])
+                formatter.write_dl([(plugin.name, plugin.label) for plugin in added_plugins])
 
 
 class _RunCommands(_AddedExcitations, SessionCommands):
@@ -116,23 +116,25 @@ ParametersFunction = Callable[..., "Mapping[str, Value | None]"]
 A parameter has the name of its option if possible."""
 
 
-def excitation_command(parameters: ParametersFunction) -> ParametersFunction:
+def excitation_command(parameters_function: ParametersFunction) -> ParametersFunction:
     """Register the subcommands ``rigd run NAME`` and ``rigd start NAME`` of an excitation.
 
     Both have the excitation's own options and the options that all sessions have.
     """
-    _add_subcommand(run_app, run_sessions, parameters)
-    _add_subcommand(start_app, start_sessions, parameters)
-    return parameters
+    _add_subcommand(run_app, run_sessions, parameters_function)
+    _add_subcommand(start_app, start_sessions, parameters_function)
+    return parameters_function
 
 
 def _add_subcommand(
-    app: typer.Typer, perform: Callable[..., None], parameters: ParametersFunction
+    app: typer.Typer, run_or_start: Callable[..., None], parameters_function: ParametersFunction
 ) -> None:
-    """Add the subcommand of an excitation to `app`; `perform` runs the sessions."""
-    excitation_kind = parameters.__name__
-    own_parameters = list(map(_command_option, inspect.signature(parameters).parameters.values()))
-    common_parameters = list(inspect.signature(perform).parameters.values())[2:]
+    """Add the subcommand of an excitation to `app`; `run_or_start` runs the sessions."""
+    excitation_kind = parameters_function.__name__
+    excitation_parameters = list(
+        map(_command_option, inspect.signature(parameters_function).parameters.values())
+    )
+    common_parameters = list(inspect.signature(run_or_start).parameters.values())[2:]
 
     def command(**options: Any) -> None:  # noqa: ANN401 - as typer hands them over
         common_options = {
@@ -141,19 +143,21 @@ def _add_subcommand(
         }
         given_parameters = {
             parameter_name: parameter_value
-            for parameter_name, parameter_value in parameters(**options).items()
+            for parameter_name, parameter_value in parameters_function(**options).items()
             if parameter_value is not None
         }
-        perform(excitation_kind, given_parameters, **common_options)
+        run_or_start(excitation_kind, given_parameters, **common_options)
 
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             p.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for p in (*own_parameters, *common_parameters)
+            for p in (*excitation_parameters, *common_parameters)
         ]
     )
-    command.__annotations__ = {p.name: p.annotation for p in (*own_parameters, *common_parameters)}
-    help_text = (parameters.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
+    command.__annotations__ = {
+        p.name: p.annotation for p in (*excitation_parameters, *common_parameters)
+    }
+    help_text = (parameters_function.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
     # Otherwise the angle -0.3 would be read as an option.
     command_settings = (
         {"ignore_unknown_options": True} if excitation_kind in ("move", "touch") else None
@@ -161,11 +165,11 @@ def _add_subcommand(
     app.command(excitation_kind, help=help_text, context_settings=command_settings)(command)
 
 
-def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's click varies
+def _added_command(app_name: str, excitation_name: str) -> Any:  # noqa: ANN401 - typer's click varies
     """Return the subcommand of an installed package's excitation; None if there is none."""
     from rigd.excitation import excitation_options, find_excitation
 
-    added_excitation = find_excitation(name)
+    added_excitation = find_excitation(excitation_name)
     if added_excitation is None:
         return None
     kind, owner = added_excitation
@@ -173,7 +177,7 @@ def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's c
     def parameters(**options: "Value") -> "dict[str, Value]":
         return options
 
-    parameters.__name__ = name
+    parameters.__name__ = excitation_name
     parameters.__doc__ = f"{kind.summary} (package {owner.label})."
     parameters.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
@@ -183,7 +187,7 @@ def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's c
                 default=option.default,
                 annotation=Annotated[option.value_type, doc(option.help)],
             )
-            for option in excitation_options(name)
+            for option in excitation_options(excitation_name)
         ]
     )
     app = typer.Typer(name=app_name, rich_markup_mode=None)
@@ -202,18 +206,20 @@ def _command_option(parameter: inspect.Parameter) -> inspect.Parameter:
     if declared_help is None:
         return parameter
     name, unit = parameter.name, unit_of(parameter.name)
-    flag = "--" + name.removesuffix("_s").removesuffix("_rad").replace("_", "-")
+    option_flag = "--" + name.removesuffix("_s").removesuffix("_rad").replace("_", "-")
     help_text = (declared_help.documentation or name).removesuffix(".") + (
         f" ({unit})." if unit else "."
     )
-    return parameter.replace(annotation=Annotated[value_type, typer.Option(flag, help=help_text)])
+    return parameter.replace(
+        annotation=Annotated[value_type, typer.Option(option_flag, help=help_text)]
+    )
 
 
 def run_sessions(
     kind: str,
     parameters: "Mapping[str, Value]",
     profile: ProfileName = "sim",
-    output: Output = SESSIONS,
+    output: Output = SESSIONS_FOLDER,
     repeat: Repeat = 1,
     seed: Seed = None,
     operator: Operator = "",
@@ -235,9 +241,9 @@ def run_sessions(
     if live:
         require_extra("live", "--live")
     session_metadata = session_notes(operator, specimen, note, meta)
-    with_live_fit = watch_fit or kind == "until"
+    with_online_fit = watch_fit or kind == "until"
     stop_request, process_group = start_processes(
-        live=live, touch=kind == "touch", fit=with_live_fit
+        with_live_view=live, with_touch=kind == "touch", with_online_fit=with_online_fit
     )
     from rigd.runner import SeriesFailedError, run_in_foreground
     from rigd.runner.planning import excitation_for
@@ -546,7 +552,7 @@ def until(
 
     Example: rigd run until --damping 1% --at-most 60
     """
-    precisions = [
+    requested_precisions = [
         *(("damping", precision_text) for precision_text in damping or ()),
         *(("frequency", precision_text) for precision_text in frequency or ()),
         *(("zeta", zeta), ("alpha", alpha), ("gamma", gamma), ("lambda", lambda_)),
@@ -554,7 +560,7 @@ def until(
     return {
         "targets": "; ".join(
             f"{parameter_name} {precision_text}"
-            for parameter_name, precision_text in precisions
+            for parameter_name, precision_text in requested_precisions
             if precision_text is not None
         ),
         "at_most_s": at_most_s,

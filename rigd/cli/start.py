@@ -28,8 +28,8 @@ from rigd.cli.options import (
     Specimen,
     TipSlope,
     WatchFit,
-    complain,
     fail,
+    print_error,
     session_notes,
 )
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _EVENT_TIMEOUT_S = 0.2
 """Longest wait in seconds for an event of the daemon, after which Ctrl-C is checked."""
-_QUICK_LOOK_PATIENCE_S = 10.0
+_QUICK_LOOK_TIMEOUT_S = 10.0
 """Longest wait in seconds for the last quick look after the end of a series."""
 
 
@@ -64,7 +64,7 @@ class SessionCommands(TyperGroup):
 
 
 def start_processes(
-    *, live: bool, touch: bool = False, fit: bool = False
+    *, with_live_view: bool, with_touch: bool = False, with_online_fit: bool = False
 ) -> "tuple[StopRequest, ProcessGroup]":
     """Make Ctrl-C a request to stop the session, and start the processes of the first session.
 
@@ -78,9 +78,11 @@ def start_processes(
     stop_request.catch_signals()
     try:
         extra_processes = [
-            extra_process for extra_process, is_needed in ((TOUCH, touch), (FIT, fit)) if is_needed
+            extra_process
+            for extra_process, is_needed in ((TOUCH, with_touch), (FIT, with_online_fit))
+            if is_needed
         ]
-        return stop_request, ProcessGroup(live=live, extra_processes=extra_processes)
+        return stop_request, ProcessGroup(live=with_live_view, extra_processes=extra_processes)
     except OSError as error:
         fail(
             f"The processes of a session cannot be started ({error.strerror}); check the limits "
@@ -122,7 +124,7 @@ def start_sessions(
                 f"{parameter_name} = {parameter_value} is not a finite number; give one.",
                 EXIT_WRONG_USE,
             )
-    request = {
+    start_request = {
         "excitation": kind,
         "parameters": {
             parameter_name: str(parameter_value.absolute())
@@ -135,19 +137,21 @@ def start_sessions(
         "force": force,
     }
     if watch_fit:  # an older daemon does not know the member
-        request["watch_fit"] = True
+        start_request["watch_fit"] = True
     if accept:  # likewise
-        request["accept"] = accept
+        start_request["accept"] = accept
     if tip_slope_rad is not None:  # likewise
-        request["tip_slope_rad"] = tip_slope_rad
+        start_request["tip_slope_rad"] = tip_slope_rad
     with daemon_client(profile) as client:
         daemon_status = client.ask("status")["daemon"]
         typer.echo(daemon_status["what_moves"], err=True)
         if not detach:
             client.ask("watch")
-        with _Interrupts.caught() as interrupts:
-            reply = client.request_unless_stopped(lambda: interrupts.count > 0, "start", **request)
-            if reply["reply"] == "stop":
+        with _InterruptCounter.counting_presses() as interrupts:
+            start_reply = client.request_unless_stopped(
+                lambda: interrupts.count > 0, "start", **start_request
+            )
+            if start_reply["reply"] == "stop":
                 typer.echo("Stopped before the session began.", err=True)
                 raise typer.Exit(EXIT_INTERRUPTED)
             if detach and interrupts.count:
@@ -155,29 +159,33 @@ def start_sessions(
                 raise typer.Exit(EXIT_INTERRUPTED)
             if detach:
                 if as_json:
-                    typer.echo(json.dumps({"series": reply["series"]}))
+                    typer.echo(json.dumps({"series": start_reply["series"]}))
                 else:
-                    _print_plan(reply["plan"], err=False)
+                    _print_plan(start_reply["plan"], to_stderr=False)
                     typer.echo(
                         "Running; rigd status shows the progress, rigd stop ends the session."
                     )
                 return
-            _print_plan(reply["plan"], err=as_json)
+            _print_plan(start_reply["plan"], to_stderr=as_json)
             # An older daemon makes no quick looks, or does not report for which sessions.
-            quick_looks = daemon_status.get("quick_looks", False)
-            series = _follow_series(
-                client, reply["series"], interrupts, as_json=as_json, quick_looks=quick_looks
+            makes_quick_looks = daemon_status.get("quick_looks", False)
+            series_event = _follow_series(
+                client,
+                start_reply["series"],
+                interrupts,
+                as_json=as_json,
+                makes_quick_looks=makes_quick_looks,
             )
     if as_json:
-        typer.echo(json.dumps({"sessions": series["sessions"]}))
-    if series["failed"]:
-        complain(series["reason"])
+        typer.echo(json.dumps({"sessions": series_event["sessions"]}))
+    if series_event["failed"]:
+        print_error(series_event["reason"])
         raise typer.Exit(EXIT_FAILED)
-    if series["stopped"]:
+    if series_event["stopped"]:
         raise typer.Exit(EXIT_INTERRUPTED)
 
 
-class _Interrupts:
+class _InterruptCounter:
     """Counter of presses of Ctrl-C: the first requests a stop, the second ends the command."""
 
     def __init__(self) -> None:
@@ -185,16 +193,16 @@ class _Interrupts:
 
     @classmethod
     @contextmanager
-    def caught(cls) -> Iterator["_Interrupts"]:
+    def counting_presses(cls) -> Iterator["_InterruptCounter"]:
         """Count Ctrl-C within this context instead of raising KeyboardInterrupt."""
         interrupts = cls()
-        previous_handler = signal.signal(signal.SIGINT, lambda *_: interrupts.note())
+        previous_handler = signal.signal(signal.SIGINT, lambda *_: interrupts.add_press())
         try:
             yield interrupts
         finally:
             signal.signal(signal.SIGINT, previous_handler)
 
-    def note(self) -> None:
+    def add_press(self) -> None:
         """Register one press of Ctrl-C."""
         self.count += 1
 
@@ -202,18 +210,18 @@ class _Interrupts:
 def _follow_series(
     client: "Client",
     series_number: int,
-    interrupts: _Interrupts,
+    interrupts: _InterruptCounter,
     *,
     as_json: bool,
-    quick_looks: bool,
+    makes_quick_looks: bool,
 ) -> dict[str, Any]:
     """Show the progress of a series of sessions until its end, and return its final event."""
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
     from rigd.runner.quick_looks import QuickLook
 
-    stop_sent = False
-    ended_sessions = 0
+    is_stop_sent = False
+    ended_session_count = 0
     awaited_quick_looks: set[str] = set()
     quick_look_paths: dict[str, str] = {}
     fits_by_path: dict[str, Any] = {}
@@ -224,8 +232,8 @@ def _follow_series(
         while final_event is None or (awaited_quick_looks and time.monotonic() < deadline_s):
             if final_event is not None and interrupts.count > interrupts_at_end:
                 break
-            if interrupts.count and not stop_sent:
-                stop_sent = True
+            if interrupts.count and not is_stop_sent:
+                is_stop_sent = True
                 client.send("stop")
                 progress_line.write_message(
                     "Stopping; press Ctrl-C again to leave while the daemon finishes."
@@ -235,7 +243,7 @@ def _follow_series(
             daemon_event = client.event(_EVENT_TIMEOUT_S) or {}
             match daemon_event.get("event"):
                 # No bar between two sessions, where it would mix with the printed path.
-                case "progress" if daemon_event["session"] > ended_sessions:
+                case "progress" if daemon_event["session"] > ended_session_count:
                     progress_line.update(
                         Phase[daemon_event["phase"].upper()],
                         daemon_event["tick"],
@@ -262,11 +270,11 @@ def _follow_series(
                     if daemon_event["path"] is not None:
                         if not as_json:
                             typer.echo(daemon_event["path"])
-                        if daemon_event.get("look_follows", quick_looks):
+                        if daemon_event.get("look_follows", makes_quick_looks):
                             awaited_quick_looks.add(daemon_event["path"])
                         if "fit" in daemon_event:
                             fits_by_path[daemon_event["path"]] = daemon_event["fit"]
-                    progress_line, ended_sessions = ProgressLine(), daemon_event["number"]
+                    progress_line, ended_session_count = ProgressLine(), daemon_event["number"]
                 case "quick_look" if daemon_event["path"] in awaited_quick_looks:
                     awaited_quick_looks.discard(daemon_event["path"])
                     quick_look = QuickLook.from_event(daemon_event)
@@ -276,7 +284,7 @@ def _follow_series(
                         progress_line.write_message(log_text)
                 case "series" if daemon_event["series"] == series_number:
                     final_event, interrupts_at_end = daemon_event, interrupts.count
-                    deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
+                    deadline_s = time.monotonic() + _QUICK_LOOK_TIMEOUT_S
                     if awaited_quick_looks:
                         progress_line.write_message("Quick look at the session; Ctrl-C skips it.")
     finally:
@@ -294,9 +302,9 @@ def _follow_series(
     return final_event | {"sessions": session_results}
 
 
-def _print_plan(plan: dict[str, Any], *, err: bool) -> None:
-    """Print the plan of a session to standard output, or to standard error if `err`."""
+def _print_plan(plan: dict[str, Any], *, to_stderr: bool) -> None:
+    """Print the plan of a session to standard output, or to standard error if `to_stderr`."""
     from rigd.runner import plan_lines
 
     for plan_line in plan_lines(plan):
-        typer.echo(plan_line, err=err)
+        typer.echo(plan_line, err=to_stderr)

@@ -20,7 +20,7 @@ _STATE_STYLES = {  # Style of each state of the daemon
 }
 _MAX_SHOWN_TRANSITIONS = 4
 """Number of the daemon's last changes of state that are shown."""
-_BUSY_PERCENT = 80.0
+_HIGH_BUS_LOAD_PERCENT = 80.0
 """Load of the CAN bus in per cent above which the load is highlighted."""
 
 
@@ -37,20 +37,20 @@ def status_table(status: dict[str, Any]) -> RenderableType:
     for row_name, row_value in _summary_rows(status):
         summary_table.add_row(row_name, row_value)
     status_parts: list[RenderableType] = [summary_table]
-    rig = status["rig"]
-    if rig is not None:
+    rig_status = status["rig"]
+    if rig_status is not None:
         is_recording = status["state"] in ("running", "stopping")
-        side_by_side = Table.grid(padding=(0, 2, 0, 0))
-        side_by_side.add_row(
-            Group("", _signal_table(rig), "", _health_table(rig)),
+        tables_grid = Table.grid(padding=(0, 2, 0, 0))
+        tables_grid.add_row(
+            Group("", _signal_table(rig_status), "", _health_table(rig_status)),
             Group(
                 "",
-                _process_table(rig["processes"]),
+                _process_table(rig_status["processes"]),
                 "",
-                _topic_table(rig["topics"], recording=is_recording),
+                _topic_table(rig_status["topics"], is_recording=is_recording),
             ),
         )
-        status_parts.append(side_by_side)
+        status_parts.append(tables_grid)
     status_parts.append(_transition_table(status["history"]))
     return Group(*status_parts)
 
@@ -72,13 +72,13 @@ def _summary_rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
     yield "state", state_text
     if status["zero_lost"]:
         yield "zero", Text("lost with the connection: run rigd zero", style="bold yellow")
-    controller_text = status["controller"]
+    controlling_client = status["controller"]
     yield (
         "control",
         Text(
             "free"
-            if controller_text is None
-            else f"process {controller_text['pid']} of {controller_text['user']}"
+            if controlling_client is None
+            else f"process {controlling_client['pid']} of {controlling_client['user']}"
         ),
     )
     if session_series is not None:
@@ -86,13 +86,11 @@ def _summary_rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
     if progress is not None:
         yield "session", Text(progress_text(progress))
     # An older daemon reports no fit; a fit without lines belongs to a lost record.
-    if session_series is not None and (
-        address_lines := (session_series.get("fit") or {}).get("text")
-    ):
-        yield "fit", Text("\n".join(address_lines))
-    rig = status["rig"]
-    if rig is not None and rig["live_view"] is not None:
-        yield "live view", Text(rig["live_view"]["url"])
+    if session_series is not None and (fit_lines := (session_series.get("fit") or {}).get("text")):
+        yield "fit", Text("\n".join(fit_lines))
+    rig_status = status["rig"]
+    if rig_status is not None and rig_status["live_view"] is not None:
+        yield "live view", Text(rig_status["live_view"]["url"])
     if daemon.get("web") is not None:
         from rigd.daemon import page_address  # late: it is slow to import
 
@@ -103,10 +101,10 @@ def _summary_rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
 def progress_text(progress: dict[str, Any]) -> str:
     """Format the progress of a session as one line: phase, percentage, time left, and counts."""
     remaining_s = progress["time_left_s"]
-    time_left = "" if remaining_s is None else f", {remaining_s:.0f} s left"
+    time_left_text = "" if remaining_s is None else f", {remaining_s:.0f} s left"
     return (
         f"{Phase[progress['phase'].upper()].display_text}, {progress['percent']:.0f} %"
-        f"{time_left}; {progress['missed']} missed, {progress['late']} late, "
+        f"{time_left_text}; {progress['missed']} missed, {progress['late']} late, "
         f"{progress['lost']} lost"
     )
 
@@ -123,23 +121,23 @@ def _series_text(series: dict[str, Any]) -> str:
     return f"{series_title}, ended: {len(complete_sessions)} complete{reason_text}"
 
 
-def _empty_table(title: str, *columns: str) -> Table:
+def _empty_table(first_title: str, *other_titles: str) -> Table:
     """Return a table without rows: first column left-aligned, other columns right-aligned."""
     empty_table = Table(
         box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold underline"
     )
-    empty_table.add_column(title, no_wrap=True)
-    for column_title in columns:
+    empty_table.add_column(first_title, no_wrap=True)
+    for column_title in other_titles:
         empty_table.add_column(column_title, justify="right", no_wrap=True)
     return empty_table
 
 
-def _signal_table(rig: dict[str, Any]) -> Table:
+def _signal_table(rig_status: dict[str, Any]) -> Table:
     """Return the table of the rig's present signals and their peaks in the record."""
     signal_table = _empty_table("signal", "now", "peak")
-    signals = rig["signals"] or {}
+    signals = rig_status["signals"] or {}
     for signal_name, unit_text, decimal_count, now, peak_value in (
-        ("angle", "rad", 5, rig["angle_rad"], None),
+        ("angle", "rad", 5, rig_status["angle_rad"], None),
         (
             "tracking error",
             "rad",
@@ -151,14 +149,14 @@ def _signal_table(rig: dict[str, Any]) -> Table:
             "coupling torque",
             "N·m",
             4,
-            rig["coupling_torque_nm"],
+            rig_status["coupling_torque_nm"],
             signals.get("peak_coupling_torque_nm"),
         ),
         (
             "torque command",
             "N·m",
             4,
-            rig["torque_command_nm"],
+            rig_status["torque_command_nm"],
             signals.get("peak_torque_command_nm"),
         ),
     ):
@@ -170,31 +168,35 @@ def _signal_table(rig: dict[str, Any]) -> Table:
     return signal_table
 
 
-def _health_table(rig: dict[str, Any]) -> Table:
+def _health_table(rig_status: dict[str, Any]) -> Table:
     """Return the table of the health of loop, recorder, bus and live view, problems in colour."""
     health_table = _empty_table("health", "")
-    for row_name, row_text, row_style in _health_rows(rig):
+    for row_name, row_text, row_style in _health_rows(rig_status):
         health_table.add_row(row_name, Text(row_text, style=row_style))
     return health_table
 
 
-def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+def _health_rows(rig_status: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yield the name, text and style of each row of `_health_table`."""
-    health, signals = rig["health"], rig["signals"]
+    health, signals = rig_status["health"], rig_status["signals"]
     if signals is not None:
         # The expected rate of the samples is that of the loop.
-        expected_hz = max(topic["expected_hz"] or 0.0 for topic in rig["topics"])
-        is_slow = signals["rate_hz"] < 0.999 * expected_hz
-        yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if is_slow else ""
+        expected_rate_hz = max(topic["expected_hz"] or 0.0 for topic in rig_status["topics"])
+        is_rate_low = signals["rate_hz"] < 0.999 * expected_rate_hz
+        yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if is_rate_low else ""
         latency_text = f"{signals['lateness_p50_us']:.0f}, {signals['lateness_p99_us']:.0f} µs"
         yield "wake-up latency p50, p99", latency_text, ""
         yield "execution time p99", f"{signals['work_p99_us']:.0f} µs", ""
-    lost_text = f"{health['missed']}, {health['late']}, {health['lost']}"
-    text_style = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
-    yield "missed, late, lost", lost_text, text_style
+    tick_counts_text = f"{health['missed']}, {health['late']}, {health['lost']}"
+    tick_counts_style = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
+    yield "missed, late, lost", tick_counts_text, tick_counts_style
     if health["bus_load_percent"] is not None:
-        load_percent = health["bus_load_percent"]
-        yield "bus load", f"{load_percent:.1f} %", "yellow" if load_percent > _BUSY_PERCENT else ""
+        bus_load_percent = health["bus_load_percent"]
+        yield (
+            "bus load",
+            f"{bus_load_percent:.1f} %",
+            "yellow" if bus_load_percent > _HIGH_BUS_LOAD_PERCENT else "",
+        )
     if health["bus_errors"] is not None:
         bus_errors = health["bus_errors"]
         yield "bus errors", str(bus_errors), "yellow" if bus_errors else ""
@@ -215,17 +217,17 @@ def _process_table(processes: list[dict[str, Any]]) -> Table:
     """Return the table of the rig's processes with their state and last heartbeat."""
     process_table = _empty_table("process", "pid", "state", "heartbeat, s ago")
     for process in processes:
-        state_style = process["state"] in ("hung", "ended")
+        is_failed_state = process["state"] in ("hung", "ended")
         process_table.add_row(
             process["name"],
             str(process["pid"]),
-            Text(process["state"], style="bold red" if state_style else ""),
+            Text(process["state"], style="bold red" if is_failed_state else ""),
             f"{process['still_s']:.1f}" if process["state"] not in ("waiting", "done") else "",
         )
     return process_table
 
 
-def _topic_table(topics: list[dict[str, Any]], *, recording: bool) -> Table:
+def _topic_table(topics: list[dict[str, Any]], *, is_recording: bool) -> Table:
     """Return the table of recorded message topics with their rate and the recorder's backlog."""
     topic_table = _empty_table("topic", "records", "Hz", "of Hz", "backlog")
     for topic in topics:
@@ -233,7 +235,7 @@ def _topic_table(topics: list[dict[str, Any]], *, recording: bool) -> Table:
             topic["name"],
             str(topic["written"]),
             _rate_text(topic["rate_hz"]),
-            _rate_text(topic["expected_hz"]) if recording else "",
+            _rate_text(topic["expected_hz"]) if is_recording else "",
             str(topic["waiting"]),
         )
     return topic_table

@@ -53,26 +53,26 @@ def _print_report(report: "StopReport") -> None:
             )
     report_lines += [f"{message_text} is being stopped." for message_text in report.stopping]
     report_lines += report.quiet
-    problems = [
+    problem_lines = [
         f"Not stopped: {message_text}; only that user or root can stop it."
         for message_text in report.others
     ]
-    problems += [
+    problem_lines += [
         f"Error: {message_text} was asked to stop, but its session did not end; check rigd "
         "status and "
         "the rig, and press the wired stop (STO) if anything moves."
         for message_text in report.running
     ]
-    problems += [
+    problem_lines += [
         f"Error: {message_text} Press the wired stop (STO)." for message_text in report.unconfirmed
     ]
-    problems += [f"Error: {message_text}" for message_text in report.doubts]
+    problem_lines += [f"Error: {message_text}" for message_text in report.doubts]
     if report.doubts and not report.running:
-        problems.append(
+        problem_lines.append(
             "Whether another session runs is not known: check the rig, and press the wired stop "
             "(STO) if anything moves."
         )
-    for message_texts, output_stream in ((report_lines, sys.stdout), (problems, sys.stderr)):
+    for message_texts, output_stream in ((report_lines, sys.stdout), (problem_lines, sys.stderr)):
         if message_texts:
             output_stream.write("".join(f"{message_text}\n" for message_text in message_texts))
             output_stream.flush()

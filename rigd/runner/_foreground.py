@@ -76,7 +76,7 @@ def run_in_foreground(
     hardware: bool = False,
     quick_look: bool = False,
     from_angle: bool = False,
-    prepare: Callable[[Profile], Profile] | None = None,
+    prepare_profile: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
     watch_fit: bool = False,
     identifies_motor: bool = False,
@@ -108,7 +108,7 @@ def run_in_foreground(
     from_angle
         Whether the excitation depends on the present motor angle. The rig is then connected before
         planning, and `build_excitation` receives the angle as ``start_rad``.
-    prepare
+    prepare_profile
         Function that returns a modified profile before the sessions are planned.
     obstacles
         Obstacles of a simulated beam, as on the command line.
@@ -143,8 +143,8 @@ def run_in_foreground(
             )
             specimen = notes.get("specimen", "")
             run_offline_checks(with_specimen(profile, specimen), accept).require_passed()
-            if prepare is not None:
-                profile = prepare(profile)
+            if prepare_profile is not None:
+                profile = prepare_profile(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
             specimen_profile = with_specimen(profile, specimen)
             _print(describe_actuation_target(profile.rig, target), to_stderr=True)

@@ -62,11 +62,11 @@ def follow(monkeypatch):
                 return lambda *arguments, **_: calls.append((name, *arguments[:1]))
 
         monkeypatch.setattr("rigd.runner.ProgressLine", Line)
-        interrupts = start._Interrupts()
+        interrupts = start._InterruptCounter()
         client = Client(interrupts, *events)
         try:
             ended = start._follow_series(
-                client, 7, interrupts, as_json=True, quick_looks=quick_looks
+                client, 7, interrupts, as_json=True, makes_quick_looks=quick_looks
             )
         except typer.Exit as ending:
             ended = ending.exit_code
