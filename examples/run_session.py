@@ -40,16 +40,16 @@ def main() -> None:
     try:
         results = run_in_foreground(
             chirp,
-            ProcessGroup(live=False),
+            ProcessGroup(with_live_view=False),
             stop,
             profile_name="sim",
             folder=folder,
-            repeat=2,
+            session_count=2,
             seed=1,
             notes={"specimen": "antenna 3", "operator": "an example"},
-            fast=True,
-            live=False,
-            force=False,
+            uses_virtual_clock=True,
+            with_live_view=False,
+            allows_saturation=False,
             quiet_stdout=True,
         )
     except RigdError as error:

@@ -97,7 +97,10 @@ def connected_rig(
 ) -> Iterator[tuple[Rig, ProcessGroup]]:
     """Start and connect the processes of a rig; they end when the context is left."""
     try:
-        with ProcessGroup(live=with_live_view) as process_group, ExitStack() as connection:
+        with (
+            ProcessGroup(with_live_view=with_live_view) as process_group,
+            ExitStack() as connection,
+        ):
             rig = Rig(profile, group=process_group)
             rig.connect()
             # This also releases the priority and cores of the supervisor, which the next

@@ -76,17 +76,17 @@ def serve(
         require_extra("live", "--live")
     if page:
         require_extra("rig", "The page")
-    rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
+    rig_profile, _ = load_rig(profile, uses_virtual_clock=fast, force_hardware=hardware)
     make_folder(output)
     exit_code = run_daemon(
         rig_profile,
         output.absolute(),
-        group=group,
-        live=live,
-        fast=fast,
-        page=page,
+        group_name=group,
+        with_live_view=live,
+        uses_virtual_clock=fast,
+        serves_page=page,
         page_port=web_port,
-        quick_looks=not no_quick_look,
+        makes_quick_looks=not no_quick_look,
     )
     if exit_code is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)

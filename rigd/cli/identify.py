@@ -156,14 +156,14 @@ def _run_sessions(
             stop_request,
             profile_name=profile_name,
             folder=folder,
-            repeat=1,
+            session_count=1,
             seed=None if seed is None else seed + session_number,
             notes=notes,
-            fast=fast,
-            live=False,
-            force=False,
+            uses_virtual_clock=fast,
+            with_live_view=False,
+            allows_saturation=False,
             quiet_stdout=quiet_stdout,
-            hardware=hardware,
+            force_hardware=hardware,
             prepare_profile=prepare_profile,
             identifies_motor=True,
         )
@@ -185,7 +185,7 @@ def _run_sessions(
 
         return [
             run_numbered_session(
-                session_builder, tune_profile, session_number, ProcessGroup(live=False)
+                session_builder, tune_profile, session_number, ProcessGroup(with_live_view=False)
             )
             for session_number, session_builder in enumerate(
                 (multisine_session, speeds_session), start=1

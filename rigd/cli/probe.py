@@ -33,8 +33,8 @@ def probe(
             process_group,
             stop_request,
             profile_name=profile,
-            fast=fast,
-            hardware=hardware,
+            uses_virtual_clock=fast,
+            force_hardware=hardware,
             report_line=partial(typer.echo, err=True),
         )
     finally:

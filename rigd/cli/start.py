@@ -82,7 +82,9 @@ def start_processes(
             for extra_process, is_needed in ((TOUCH, with_touch), (FIT, with_online_fit))
             if is_needed
         ]
-        return stop_request, ProcessGroup(live=with_live_view, extra_processes=extra_processes)
+        return stop_request, ProcessGroup(
+            with_live_view=with_live_view, extra_processes=extra_processes
+        )
     except OSError as error:
         fail(
             f"The processes of a session cannot be started ({error.strerror}); check the limits "

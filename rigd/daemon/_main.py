@@ -34,11 +34,11 @@ def run_daemon(
     profile: Profile,
     folder: Path,
     *,
-    group: str | None,
-    live: bool,
-    fast: bool,
-    quick_looks: bool,
-    page: bool = False,
+    group_name: str | None,
+    with_live_view: bool,
+    uses_virtual_clock: bool,
+    makes_quick_looks: bool,
+    serves_page: bool = False,
     page_port: int | None = None,
 ) -> signal.Signals:
     """Run the daemon of a rig until a signal ends it.
@@ -49,13 +49,13 @@ def run_daemon(
         Profile of the rig.
     folder
         Folder of the session files.
-    group
+    group_name
         Group of users who may operate the rig through the daemon, in addition to this user.
-    live, fast
+    with_live_view, uses_virtual_clock
         See :class:`rigd.runner._rig.Rig`.
-    quick_looks
+    makes_quick_looks
         Whether to make a quick look at each session.
-    page
+    serves_page
         Whether to serve the operator's page.
     page_port
         Port of the page on the loopback interface, or None for 8720 or, if used, another port.
@@ -79,28 +79,28 @@ def run_daemon(
         resources.enter_context(
             RigLock(profile.name, "rigd serve", hardware=target is ActuationTarget.HARDWARE)
         )
-        daemon_socket = socket_path(profile.name, None if group is None else GROUP_FOLDER)
-        listener = resources.enter_context(bind(daemon_socket, group))
+        daemon_socket = socket_path(profile.name, None if group_name is None else GROUP_FOLDER)
+        listener = resources.enter_context(bind(daemon_socket, group_name))
         resources.callback(daemon_socket.unlink, missing_ok=True)
         rig_worker = resources.enter_context(ThreadPoolExecutor(1, "rig"))
         server = Server(listener)
         service = Service(
-            Rig(profile, fast=fast, live=live),
+            Rig(profile, uses_virtual_clock=uses_virtual_clock, with_live_view=with_live_view),
             profile,
             folder,
             rig_worker,
             server.publish,
             partial(actuation_target, profile.rig),
-            fast=fast,
-            live=live,
-            quick_looks=quick_looks,
+            uses_virtual_clock=uses_virtual_clock,
+            with_live_view=with_live_view,
+            makes_quick_looks=makes_quick_looks,
         )
         _log.info(
             "%s Listening on %s", describe_actuation_target(profile.rig, target), daemon_socket
         )
         for simulation_difference in simulation_differences(profile.rig):
             _log.warning("the simulated rig has %s", simulation_difference)
-        if page:
+        if serves_page:
             from rigd.daemon._page import PageProcess
 
             page_process = PageProcess(

@@ -66,10 +66,10 @@ _log = logging.getLogger(LOGGER_NAME)
 class Service:
     """Service that controls a rig for clients; its methods run in the event loop's thread.
 
-    The rig is not connected yet and was created with the options `fast` and `live`; its slow calls
-    run in the single thread of `worker`. `publish` sends an event to the clients that have
-    subscribed, `find_target` returns what would move if the rig were connected now. `controller` is
-    the client that controls the rig, or None.
+    The rig is not connected yet and was created with the options `uses_virtual_clock` and
+    `with_live_view`; its slow calls run in the single thread of `rig_executor`. `publish` sends an
+    event to the clients that have subscribed, `find_actuation_target` returns what would move if
+    the rig were connected now. `controller` is the client that controls the rig, or None.
     """
 
     def __init__(
@@ -77,26 +77,26 @@ class Service:
         rig: Rig,
         profile: Profile,
         folder: Path,
-        worker: Executor,
+        rig_executor: Executor,
         publish: PublishEvent,
-        find_target: Callable[[], ActuationTarget],
+        find_actuation_target: Callable[[], ActuationTarget],
         *,
-        fast: bool = False,
-        live: bool = False,
-        quick_looks: bool = False,
+        uses_virtual_clock: bool = False,
+        with_live_view: bool = False,
+        makes_quick_looks: bool = False,
     ) -> None:
         self._rig = rig
         self._profile = profile
         self._folder = folder
-        self._worker = worker
+        self._worker = rig_executor
         self._publish = publish
-        self._find_target = find_target
-        self._announced_target = find_target()
+        self._find_target = find_actuation_target
+        self._announced_target = find_actuation_target()
         self._failed_checks = [
             asdict(failed_check) for failed_check in run_offline_checks(profile).failed
         ]
-        self._fast = fast
-        self._live = live
+        self._uses_virtual_clock = uses_virtual_clock
+        self._live = with_live_view
         self._state_machine = DaemonStateMachine(self._report_transition)
         self._began_utc_ns = time.time_ns()
         self._fault_reason = ""
@@ -108,7 +108,7 @@ class Service:
         """Number of stops that were requested so far."""
         self._is_closing = False
         self._series: ServedSeries | None = None
-        self._quick_looks = QuickLookQueue(self._report_quick_look) if quick_looks else None
+        self._quick_looks = QuickLookQueue(self._report_quick_look) if makes_quick_looks else None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._series_count = 0
@@ -250,7 +250,7 @@ class Service:
                 moving=self._announced_target.value,
                 hardware=self._announced_target is ActuationTarget.HARDWARE,
                 moving_text=describe_actuation_target(self._profile.rig, self._announced_target),
-                fast=self._fast,
+                fast=self._uses_virtual_clock,
                 live=self._live,
                 web=self._page_address,
                 calibration=self._rig.calibration,
@@ -589,7 +589,7 @@ class Service:
         series, rig_status = self._series, self._rig_status
         if series is None or not series.running or series.planned is None or rig_status is None:
             return None
-        rate_hz = None if self._fast else self._profile.rig.rate_hz
+        rate_hz = None if self._uses_virtual_clock else self._profile.rig.rate_hz
         progress_event = progress_document(rig_status, series.planned.ticks, rate_hz)
         return {"session": series.session, "repeat": series.request.repeat, **progress_event}
 

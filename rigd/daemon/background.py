@@ -55,13 +55,13 @@ class PredictionJob:
     """Kind of the excitation, such as "chirp"."""
     parameters: Mapping[str, Value]
     """Parameters of the excitation by their names."""
-    force: bool
+    allows_saturation: bool
     """Whether the torques of motor and sensor may be clipped."""
     specimen: str
     """Name of the specimen, or empty for the beam of the profile."""
     start_rad: float = 0.0
     """Motor angle at the start, relative to the rig's zero."""
-    accept: tuple[str, ...] = ()
+    accepted_row_names: tuple[str, ...] = ()
     """Names of rows of `rigd check` that may fail."""
     tip_slope_rad: float | None = None
     """Maximum tip slope of an identification, or None for the limit of the profile."""
@@ -71,10 +71,17 @@ class PredictionJob:
         profile = with_specimen(self.profile, self.specimen)
         profile = with_tip_slope(profile, self.tip_slope_rad)
         excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
-        plan = predict_session(profile, excitation, force=self.force, accept=self.accept)
+        plan = predict_session(
+            profile,
+            excitation,
+            allows_saturation=self.allows_saturation,
+            accepted_row_names=self.accepted_row_names,
+        )
         return {
             "plan": plan_document(profile, excitation, plan),
-            "largest_amplitude_rad": largest_amplitude(profile, excitation, force=self.force),
+            "largest_amplitude_rad": largest_amplitude(
+                profile, excitation, allows_saturation=self.allows_saturation
+            ),
         }
 
 
@@ -152,10 +159,10 @@ class PlanJob:
                 profile,
                 excitation_for(profile, request.excitation, request.parameters, self.start_rad),
                 self.folder,
-                repeat=request.repeat,
+                session_count=request.repeat,
                 notes=notes,
-                force=request.force,
-                accept=request.accept,
+                allows_saturation=request.force,
+                accepted_row_names=request.accept,
                 watch_fit=request.watch_fit,
             )
         except NoRoomError as error:  # the same request may succeed later

@@ -65,17 +65,17 @@ def run_in_foreground(
     *,
     profile_name: str,
     folder: Path,
-    repeat: int,
+    session_count: int,
     seed: int | None,
     notes: Mapping[str, str],
-    fast: bool,
-    live: bool,
-    force: bool,
-    accept: Sequence[str] = (),
+    uses_virtual_clock: bool,
+    with_live_view: bool,
+    allows_saturation: bool,
+    accepted_row_names: Sequence[str] = (),
     quiet_stdout: bool,
-    hardware: bool = False,
+    force_hardware: bool = False,
     quick_look: bool = False,
-    from_angle: bool = False,
+    starts_at_present_angle: bool = False,
     prepare_profile: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
     watch_fit: bool = False,
@@ -98,14 +98,15 @@ def run_in_foreground(
         Name or path of the profile.
     folder
         Folder of the session files; created if it does not exist.
-    repeat, seed, notes, fast, live, force, accept, hardware
+    session_count, seed, notes, uses_virtual_clock, with_live_view, allows_saturation,
+    accepted_row_names, force_hardware
         Options of the command line. The rig is connected once for all sessions. Each session waits
         until the beam is at rest.
     quiet_stdout
         Print all text to standard error, because standard output is reserved for a JSON document.
     quick_look
         Make a quick look at each session, and wait some seconds for the last one.
-    from_angle
+    starts_at_present_angle
         Whether the excitation depends on the present motor angle. The rig is then connected before
         planning, and `build_excitation` receives the angle as ``start_rad``.
     prepare_profile
@@ -139,10 +140,16 @@ def run_in_foreground(
         # The lock of the rig is released last, when no process uses the devices any more.
         with contextlib.ExitStack() as locks, group:
             profile, target = load_rig(
-                profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
+                profile_name,
+                uses_virtual_clock=uses_virtual_clock,
+                seed=seed,
+                force_hardware=force_hardware,
+                obstacles=obstacles,
             )
             specimen = notes.get("specimen", "")
-            run_offline_checks(with_specimen(profile, specimen), accept).require_passed()
+            run_offline_checks(
+                with_specimen(profile, specimen), accepted_row_names
+            ).require_passed()
             if prepare_profile is not None:
                 profile = prepare_profile(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
@@ -150,23 +157,23 @@ def run_in_foreground(
             _print(describe_actuation_target(profile.rig, target), to_stderr=True)
             for difference in simulation_differences(profile.rig):
                 print_line(f"Warning: the simulated rig has {difference}.")
-            is_exclusive = not (fast and target is ActuationTarget.SIMULATED)
+            is_exclusive = not (uses_virtual_clock and target is ActuationTarget.SIMULATED)
             is_hardware = target is ActuationTarget.HARDWARE
             locks.enter_context(
                 RigLock(profile.name, "rigd run", hardware=is_hardware, exclusive=is_exclusive)
             )
-            rig = Rig(profile, fast=fast, group=group)
-            if from_angle and not stop.requested:
+            rig = Rig(profile, uses_virtual_clock=uses_virtual_clock, group=group)
+            if starts_at_present_angle and not stop.requested:
                 rig.connect(target)
                 build_excitation = partial(build_excitation, start_rad=rig.angle_rad)
             session_series = Series(
                 specimen_profile,
                 build_excitation(specimen_profile),
                 folder,
-                repeat=repeat,
+                session_count=session_count,
                 notes=notes,
-                force=force,
-                accept=accept,
+                allows_saturation=allows_saturation,
+                accepted_row_names=accepted_row_names,
                 watch_fit=watch_fit,
                 identifies_motor=identifies_motor,
             )
@@ -175,12 +182,12 @@ def run_in_foreground(
                 print_line(line)
             if not (stop.requested or rig.connected):
                 rig.connect(target)
-            with _TerminalProgress(session_series.ticks, repeat, print_line) as operator:
+            with _TerminalProgress(session_series.ticks, session_count, print_line) as operator:
                 session_series.run(
-                    rig, stop, operator, with_live_view=live, quick_looks=quick_looks
+                    rig, stop, operator, with_live_view=with_live_view, quick_looks=quick_looks
                 )
         if stop.requested:
-            _print_stop(results, repeat)
+            _print_stop_message(results, session_count)
         if quick_looks is not None:
             _await_quick_looks(quick_looks, stop)
     except SessionFailedError as error:
@@ -300,14 +307,14 @@ def _await_quick_looks(quick_looks: QuickLookQueue, stop: StopRequest) -> None:
     stop.requested = was_stopped  # this Ctrl-C skipped the quick look only
 
 
-def _print_stop(results: Sequence[SessionResult], repeat: int) -> None:
+def _print_stop_message(results: Sequence[SessionResult], session_count: int) -> None:
     """Print that a stop was requested before the first session or between two sessions.
 
     Nothing is printed if a session itself was stopped, because its result states the stop.
     """
-    if len(results) == repeat or any(not result.is_successful for result in results):
+    if len(results) == session_count or any(not result.is_successful for result in results):
         return
-    count_text = f" after {len(results)} of {repeat} sessions" if results else ""
+    count_text = f" after {len(results)} of {session_count} sessions" if results else ""
     _print(
         f"Stopped: no record{count_text}. Stopped by the operator before the session began.",
         to_stderr=True,

@@ -42,9 +42,11 @@ class LiveViewClient(WorkerClient):
 
     worker = LIVE
 
-    def __init__(self, group: ProcessGroup, rig_name: str, *, fast: bool = False) -> None:
+    def __init__(
+        self, group: ProcessGroup, rig_name: str, *, uses_virtual_clock: bool = False
+    ) -> None:
         super().__init__(group)
-        self._fast = fast
+        self._uses_virtual_clock = uses_virtual_clock
         self.address: LiveAddress | None = None
         self._job = LiveJob(rig_name, group.channels.specs)
         self._session: LiveSession | None = None
@@ -63,7 +65,7 @@ class LiveViewClient(WorkerClient):
         self._wait(lambda: self._is_ready, _ADDRESS_TIMEOUT_S, is_not_stopped)
         start_positions = tuple(ring.written_count for ring in self._group.channels.rings)
         self._session = LiveSession(
-            describe_planned_session(order, fast=self._fast),
+            describe_planned_session(order, uses_virtual_clock=self._uses_virtual_clock),
             str(uuid.uuid4()),
             start_positions,
             order.path.parent,
@@ -124,13 +126,15 @@ class LiveViewClient(WorkerClient):
         self.address = None
 
 
-def describe_planned_session(order: SessionOrder, *, fast: bool = False) -> SessionDescription:
+def describe_planned_session(
+    order: SessionOrder, *, uses_virtual_clock: bool = False
+) -> SessionDescription:
     """Return the data of a session that the live view shows, such as beam, sweep and limits."""
     rig_parameters, excitation = order.profile.rig, order.excitation
     absent_plots: set[str] = set()
     if rig_parameters.devices.drive == rig_parameters.devices.sensor == "sim":
         absent_plots |= BUS_PLOT_COMPONENTS
-    if fast:
+    if uses_virtual_clock:
         absent_plots |= REAL_TIME_PLOT_COMPONENTS
     return SessionDescription(
         name=order.path.stem,

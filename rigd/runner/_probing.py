@@ -169,8 +169,8 @@ def probe_in_foreground(
     stop: StopRequest,
     *,
     profile_name: str,
-    fast: bool,
-    hardware: bool,
+    uses_virtual_clock: bool,
+    force_hardware: bool,
     report_line: Callable[[str], None],
 ) -> tuple[Profile, ProbeResult]:
     """Make a probing move for `rigd probe`, even if the profile needs no verification.
@@ -183,7 +183,7 @@ def probe_in_foreground(
         Stop request of the operator.
     profile_name
         Name or path of the profile.
-    fast, hardware
+    uses_virtual_clock, force_hardware
         Options of the command line.
     report_line
         Function that gets messages for the operator before the move begins.
@@ -201,14 +201,16 @@ def probe_in_foreground(
         If the rig cannot be connected, or the move is stopped or ended by an interlock.
     """
     with contextlib.ExitStack() as locks, group:
-        profile, actuation_target = load_rig(profile_name, fast=fast, hardware=hardware)
+        profile, actuation_target = load_rig(
+            profile_name, uses_virtual_clock=uses_virtual_clock, force_hardware=force_hardware
+        )
         report_line(describe_actuation_target(profile.rig, actuation_target))
-        is_exclusive = not (fast and actuation_target is ActuationTarget.SIMULATED)
+        is_exclusive = not (uses_virtual_clock and actuation_target is ActuationTarget.SIMULATED)
         is_hardware = actuation_target is ActuationTarget.HARDWARE
         locks.enter_context(
             RigLock(profile.name, "rigd probe", hardware=is_hardware, exclusive=is_exclusive)
         )
-        rig = Rig(profile, fast=fast, group=group)
+        rig = Rig(profile, uses_virtual_clock=uses_virtual_clock, group=group)
         rig.connect(actuation_target)
         report_line(probing_announcement(profile))
         return profile, run_probing_move(profile, rig, stop)

@@ -29,7 +29,7 @@ class ProcessGroup:
 
     Parameters
     ----------
-    live
+    with_live_view
         Also start the publisher of the live view.
     extra_processes
         Further processes to start at once. All other processes are started when they are needed.
@@ -43,14 +43,14 @@ class ProcessGroup:
 
     Attributes
     ----------
-    live
+    with_live_view
         Whether the publisher of the live view is started too.
     cores
         Processor cores for processes that are started later; empty for the cores of this process.
     """
 
-    def __init__(self, *, live: bool, extra_processes: Collection[Worker] = ()) -> None:
-        self.live = live
+    def __init__(self, *, with_live_view: bool, extra_processes: Collection[Worker] = ()) -> None:
+        self.with_live_view = with_live_view
         self._extra_processes = frozenset(extra_processes)
         self.cores: frozenset[int] = frozenset()
         self._fds: list[int] = []
@@ -62,7 +62,7 @@ class ProcessGroup:
             while len(self._fds) < _SHARED_MEMORY_FILES:
                 self._fds.append(shared_memory_fd())
             wanted_processes = {CONTROL, RECORDER, *self._extra_processes} | (
-                {LIVE} if live else set()
+                {LIVE} if with_live_view else set()
             )
             for process in (process for process in PROCESSES if process in wanted_processes):
                 self._start(process)
@@ -127,7 +127,7 @@ class ProcessGroup:
         return self._channels
 
     def allocate_memory(
-        self, rate_hz: float, *, fast: bool = False, may_be_observed: bool = False
+        self, rate_hz: float, *, uses_virtual_clock: bool = False, may_be_observed: bool = False
     ) -> None:
         """Allocate the shared memory for sessions at a sample rate.
 
@@ -135,7 +135,7 @@ class ProcessGroup:
         ----------
         rate_hz
             Sample rate, in ticks per second.
-        fast
+        uses_virtual_clock
             Whether the sessions run under the virtual clock.
         may_be_observed
             Whether processes that read samples, such as a fit, may be started later.
@@ -149,7 +149,9 @@ class ProcessGroup:
         from rigd.safety.limits import RECORDER_BUFFER_S
 
         # Readers of samples, such as a live view or a fit, are slower than the virtual clock.
-        is_faster_than_observers = fast and (self.live or self._extra_processes or may_be_observed)
+        is_faster_than_observers = uses_virtual_clock and (
+            self.with_live_view or self._extra_processes or may_be_observed
+        )
         buffered_s = VIRTUAL_CLOCK_BUFFER_S if is_faster_than_observers else RECORDER_BUFFER_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 

@@ -68,9 +68,9 @@ class Rig:
     ----------
     profile
         Profile of the rig.
-    fast
+    uses_virtual_clock
         Run sessions under the virtual clock, faster than real time.
-    live
+    with_live_view
         Show each session in a live view.
     group
         Processes that are already started and are used for the first connection.
@@ -88,13 +88,13 @@ class Rig:
         self,
         profile: Profile,
         *,
-        fast: bool = False,
-        live: bool = False,
+        uses_virtual_clock: bool = False,
+        with_live_view: bool = False,
         group: ProcessGroup | None = None,
     ) -> None:
         self._profile = profile
-        self._fast = fast
-        self._live = live
+        self._uses_virtual_clock = uses_virtual_clock
+        self._live = with_live_view
         self._group = group
         self._connection: DevicesConnected | None = None
         self._view: LiveViewClient | None = None
@@ -159,14 +159,17 @@ class Rig:
         try:
             # For processes that are started here, it is not yet known which sessions follow.
             may_be_observed = self._group is None
-            group = self._group = self._group or ProcessGroup(live=self._live)
+            group = self._group = self._group or ProcessGroup(with_live_view=self._live)
             granted_settings = self._raise_priority(group)
             if reset_fault:
                 self._reset_fault(target)
             _allocate_shared_memory(
-                group, self._profile.rig.rate_hz, fast=self._fast, may_be_observed=may_be_observed
+                group,
+                self._profile.rig.rate_hz,
+                uses_virtual_clock=self._uses_virtual_clock,
+                may_be_observed=may_be_observed,
             )
-            job = ControlJob(self._profile, target, group.channels.specs, self._fast)
+            job = ControlJob(self._profile, target, group.channels.specs, self._uses_virtual_clock)
             group.idle_process(CONTROL).start(job)
             connection = self._await_message(_CONNECT_TIMEOUT_S)
             assert isinstance(connection, DevicesConnected)
@@ -177,7 +180,9 @@ class Rig:
             self.disconnect()
             raise RigError(str(error)) from None
         if LIVE in group:
-            self._view = LiveViewClient(group, self._profile.name, fast=self._fast)
+            self._view = LiveViewClient(
+                group, self._profile.name, uses_virtual_clock=self._uses_virtual_clock
+            )
         self.connected = True
         self.zero_lost |= self._has_zero_to_lose
         # The angle of this connection is the zero now. Only on hardware can the next one differ.
@@ -351,7 +356,7 @@ class Rig:
         assert CONTROL.max_silence_s is not None
         max_silence_s = (
             _VIRTUAL_CLOCK_HEARTBEAT_TIMEOUT_S
-            if self._fast
+            if self._uses_virtual_clock
             else CONTROL.max_silence_s + _ENABLE_TIMEOUT_S
         )
         deadline_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_TIMEOUT_S
@@ -436,7 +441,7 @@ class Rig:
 
     def _raise_priority(self, group: ProcessGroup) -> dict[str, str]:
         """Raise the priority of this process, and return the granted settings as metadata."""
-        if self._fast:
+        if self._uses_virtual_clock:
             return {}
         realtime_settings = self._profile.realtime
         self._raised_priority = RaisedPriority(
@@ -524,11 +529,13 @@ def _reset_session_fields(shared_state: SharedState) -> None:
 
 
 def _allocate_shared_memory(
-    group: ProcessGroup, rate_hz: float, *, fast: bool, may_be_observed: bool
+    group: ProcessGroup, rate_hz: float, *, uses_virtual_clock: bool, may_be_observed: bool
 ) -> None:
     """Allocate the shared memory of the processes; raise RigError if that fails."""
     try:
-        group.allocate_memory(rate_hz, fast=fast, may_be_observed=may_be_observed)
+        group.allocate_memory(
+            rate_hz, uses_virtual_clock=uses_virtual_clock, may_be_observed=may_be_observed
+        )
     except OSError as error:
         raise RigError(
             f"No shared memory for the session processes ({error.strerror}); check the "

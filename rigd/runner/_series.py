@@ -60,14 +60,14 @@ class Series:
         Profile of the rig, and excitation of each session.
     folder
         Folder of the session files; created if it does not exist.
-    repeat
+    session_count
         Number of sessions.
     notes
         Metadata of the user: operator, specimen, note and others. Empty texts are omitted. If the
         specimen has a file, the profile must already contain the beam of that file.
-    force
+    allows_saturation
         See :func:`rigd.runner.planning.plan_session`.
-    accept
+    accepted_row_names
         Names of rows of `rigd check` that may fail. The failed rows are recorded in the files.
     watch_fit
         Fit each record repeatedly during the session.
@@ -85,7 +85,8 @@ class Series:
     Raises
     ------
     CheckFailedError, UnknownRowError
-        If a check of the profile fails and is not accepted, or `accept` contains an unknown name.
+        If a check of the profile fails and is not accepted, or `accepted_row_names` contains an
+        unknown name.
     RefusedError, ControlDesignError, RealisationError
         If the sessions would exceed limits, cannot be predicted, or lack metadata that the profile
         requires.
@@ -99,10 +100,10 @@ class Series:
         excitation: Excitation,
         folder: Path,
         *,
-        repeat: int = 1,
+        session_count: int = 1,
         notes: Mapping[str, str] | None = None,
-        force: bool = False,
-        accept: Sequence[str] = (),
+        allows_saturation: bool = False,
+        accepted_row_names: Sequence[str] = (),
         watch_fit: bool = False,
         identifies_motor: bool = False,
     ) -> None:
@@ -111,17 +112,23 @@ class Series:
         self._profile = profile
         self._excitation = excitation
         self._folder = folder
-        self._repeat = repeat
+        self._session_count = session_count
         self._notes = {
             note_name: note_text for note_name, note_text in (notes or {}).items() if note_text
         }
         check_required(profile, self._notes)
-        if excitation.stays and repeat > 1:
+        if excitation.stays and session_count > 1:
             raise RefusedError(
-                f"--repeat {repeat}: a {excitation.kind} does not end where it starts, so it is "
+                f"--repeat {session_count}: a {excitation.kind} does not end where it starts, so "
+                "it is "
                 "run once; omit the option."
             )
-        self.plan = plan_session(profile, excitation, force=force, accept=accept)
+        self.plan = plan_session(
+            profile,
+            excitation,
+            allows_saturation=allows_saturation,
+            accepted_row_names=accepted_row_names,
+        )
         self._touch = touch_search(profile, excitation)
         self.results: list[SessionResult] = []
         self._require_disk_space()
@@ -161,7 +168,7 @@ class Series:
             Stop request of the operator.
         listener
             Receiver of the progress.
-        live
+        with_live_view
             Show each session in a live view.
         can_receive_stop
             See :class:`rigd.runner.session.SessionSupervisor`.
@@ -184,18 +191,18 @@ class Series:
             if stop.requested and rig.connected:
                 return  # the probing move was stopped, and nothing failed
             raise
-        for session_number in range(1, self._repeat + 1):
+        for session_number in range(1, self._session_count + 1):
             if quick_looks is not None and session_number > 1:
                 _await_quick_look(quick_looks, rig, stop)
             if stop.requested:
                 return
             self._require_disk_space()
-            is_numbered = self._repeat > 1
+            is_numbered = self._session_count > 1
             session_path = choose_path(
                 self._folder, self._excitation.kind, session_number if is_numbered else None
             )
             session_notes = self._notes | (
-                {"series": f"{session_number} of {self._repeat}"} if is_numbered else {}
+                {"series": f"{session_number} of {self._session_count}"} if is_numbered else {}
             )
             listener.on_start(session_number, session_path)
             session_order = SessionOrder(

@@ -243,26 +243,36 @@ def excitation_for(
 
 
 def plan_session(
-    profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
+    profile: Profile,
+    excitation: Excitation,
+    *,
+    allows_saturation: bool = False,
+    accepted_row_names: Sequence[str] = (),
 ) -> SessionPlan:
     """Return the plan of a session; raise if checks or limits of the profile forbid the session.
 
     Parameters
     ----------
-    profile, excitation, force, accept
+    profile, excitation, allows_saturation, accepted_row_names
         See `predict_session`.
 
     Raises
     ------
     CheckFailedError, UnknownRowError
-        If a check of the profile fails and is not accepted, or `accept` contains an unknown name.
+        If a check of the profile fails and is not accepted, or `accepted_row_names` contains an
+        unknown name.
     RefusedError
         If the session would exceed limits. The message names these limits and the largest possible
         amplitude.
     ControlDesignError, RealisationError, UnknownValueError
         As `predict_session` does.
     """
-    plan = predict_session(profile, excitation, force=force, accept=accept)
+    plan = predict_session(
+        profile,
+        excitation,
+        allows_saturation=allows_saturation,
+        accepted_row_names=accepted_row_names,
+    )
     plan.offline_check_result.require_passed()
     if plan.refused:
         raise RefusedError(plan.refused)
@@ -270,7 +280,11 @@ def plan_session(
 
 
 def predict_session(
-    profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
+    profile: Profile,
+    excitation: Excitation,
+    *,
+    allows_saturation: bool = False,
+    accepted_row_names: Sequence[str] = (),
 ) -> SessionPlan:
     """Return the plan of a session, whose field `refused` states why it is refused, if it is.
 
@@ -278,16 +292,16 @@ def predict_session(
     ----------
     profile, excitation
         Profile of the rig, and excitation of the session.
-    force
+    allows_saturation
         Whether the torques of motor and sensor may be clipped. All other limits always apply,
         because exceeding them would end the session.
-    accept
+    accepted_row_names
         Names of rows of `rigd check` that may fail.
 
     Raises
     ------
     UnknownRowError
-        If `accept` contains an unknown name.
+        If `accepted_row_names` contains an unknown name.
     UnknownValueError
         If a required value of the profile is stated as unknown.
     ControlDesignError
@@ -295,7 +309,7 @@ def predict_session(
     RealisationError
         If the beam's damping cannot be realised by a model with poles.
     """
-    offline_check = run_offline_checks(profile, accept)
+    offline_check = run_offline_checks(profile, accepted_row_names)
     closed_loop, instability_warning = stable_loop(loop_model_with(profile, excitation.model))
     prediction = predict(closed_loop, excitation)
     violations, torque_violations = (
@@ -309,8 +323,10 @@ def predict_session(
     refusals = list(offline_check.refusals)
     tip_slope = _limited_tip_slope(profile, prediction) if has_slope_limit(excitation) else None
     slope_violation = tip_slope is not None and tip_slope.violation_text()
-    if violations or slope_violation or (torque_violations and not force):
-        amplitude_advice = _amplitude_advice(profile, excitation, force=force)
+    if violations or slope_violation or (torque_violations and not allows_saturation):
+        amplitude_advice = _amplitude_advice(
+            profile, excitation, allows_saturation=allows_saturation
+        )
         refusals += [f"{violation_text}; {amplitude_advice}." for violation_text in violations]
         if tip_slope is not None and slope_violation:
             slope_advice = slope_remedy(excitation, tip_slope.value, tip_slope.limit)
@@ -344,11 +360,11 @@ def predict_session(
     )
 
 
-def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) -> str:
+def _amplitude_advice(profile: Profile, excitation: Excitation, *, allows_saturation: bool) -> str:
     """Return advice, as part of an error message, on how to change an excitation within limits."""
     if excitation.kind in KINDS_WITH_TARGET_ANGLE:
         return "reduce the angle or the speed"
-    largest_rad = largest_amplitude(profile, excitation, force=force)
+    largest_rad = largest_amplitude(profile, excitation, allows_saturation=allows_saturation)
     return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
 
 
@@ -365,7 +381,7 @@ def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> Post
 
 
 def largest_amplitude(
-    profile: Profile, excitation: Excitation, *, force: bool = False
+    profile: Profile, excitation: Excitation, *, allows_saturation: bool = False
 ) -> float | None:
     """Return the largest amplitude with which an excitation stays within all limits.
 
@@ -375,7 +391,7 @@ def largest_amplitude(
     ----------
     profile, excitation
         Profile of the rig, and excitation; the amplitude of the excitation is ignored.
-    force
+    allows_saturation
         Whether torques may be clipped, so that the torque limits are ignored.
 
     Returns
@@ -407,7 +423,7 @@ def largest_amplitude(
         if tip_slope is not None:
             unclippable_peaks += (replace(tip_slope, value=tip_slope.value * amplitude_scale),)
         return _largest_fraction(
-            unclippable_peaks if force else unclippable_peaks + clippable_peaks
+            unclippable_peaks if allows_saturation else unclippable_peaks + clippable_peaks
         )
 
     # All peaks are proportional to the amplitude, except for the friction compensation.

@@ -96,9 +96,9 @@ class SessionOrder:
 def load_rig(
     profile_name: str,
     *,
-    fast: bool = False,
+    uses_virtual_clock: bool = False,
     seed: int | None = None,
-    hardware: bool = False,
+    force_hardware: bool = False,
     obstacles: Sequence[str] = (),
 ) -> tuple[Profile, ActuationTarget]:
     """Return a profile, and whether its sessions move the hardware or a simulated rig.
@@ -107,11 +107,11 @@ def load_rig(
     ----------
     profile_name
         Name of the profile, or path of its file.
-    fast
+    uses_virtual_clock
         Whether the session runs under the virtual clock, faster than real time.
     seed
         Seed of a simulated rig's noise, or None for the profile's seed, if it states one.
-    hardware
+    force_hardware
         Whether the operator explicitly requests that the hardware moves.
     obstacles
         Obstacles of a simulated beam, in addition to the obstacles of the profile.
@@ -134,23 +134,27 @@ def load_rig(
     if refusals:
         raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
     target = actuation_target(profile.rig)
-    if hardware and target is not ActuationTarget.HARDWARE:
+    if force_hardware and target is not ActuationTarget.HARDWARE:
         raise RefusedError(
             f"--hardware: {describe_actuation_target(profile.rig, target)} Omit the option, or end "
             "the simulated rig."
         )
-    if target is ActuationTarget.HARDWARE and not hardware:
+    if target is ActuationTarget.HARDWARE and not force_hardware:
         _refuse_unreachable_simulators(profile)
-    options = {"--fast": fast, "--seed": seed is not None, "--obstacle": bool(obstacles)}
+    options = {
+        "--fast": uses_virtual_clock,
+        "--seed": seed is not None,
+        "--obstacle": bool(obstacles),
+    }
     simulation_options = [option for option, is_given in options.items() if is_given]
     if target is ActuationTarget.HARDWARE and simulation_options:
         raise RefusedError(
             f"{simulation_options[0]}: {profile.path} is a profile of hardware, and the option is "
             "for simulated rigs only. Without it, the session would move the motor. To simulate "
             f"the session, first start rigd simulate --profile {shlex.quote(profile_name)}"
-            f"{' --lock-step' if fast else ''} in another terminal."
+            f"{' --lock-step' if uses_virtual_clock else ''} in another terminal."
         )
-    if fast and not target.allows_virtual_clock:
+    if uses_virtual_clock and not target.allows_virtual_clock:
         raise RefusedError(
             f"--fast: {target.value} of {profile.path} moves in real time, which cannot be "
             "skipped; omit the option. Or start rigd simulate with --lock-step."

@@ -62,7 +62,7 @@ def test_whole_record_if_control_process_dies_while_returning(tmp_path):
     profile = load_shipped("sim")
     profile = replace(profile, session=replace(profile.session, tare_s=0.5, return_s=60.0))
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=0.3, rest_s=0.1, ring_down_s=0.0)
-    rig = Rig(profile, fast=True)
+    rig = Rig(profile, uses_virtual_clock=True)
 
     def listener(progress, events):
         control = next(p for p in rig.status().processes if p.name == "control")

@@ -63,7 +63,7 @@ def wrong_value(tmp_path, can_profile):
 def refusal(profile, folder, kind, accept=(), **options):
     """Return the reason for refusing a session, or ""."""
     try:
-        Series(profile, excitation_for(profile, kind, options), folder, accept=accept)
+        Series(profile, excitation_for(profile, kind, options), folder, accepted_row_names=accept)
     except (RigError, ControlDesignError) as error:
         return str(error)
     except Exception as error:
@@ -119,7 +119,7 @@ def test_only_accepted_rows_pass(wrong_value, tmp_path):
     assert "(travel_missed_ticks)" in left
     assert "(travel_no_angle)" not in left
     assert not refusal(profile, tmp_path, "hold", accept=rows)
-    series = Series(profile, hold(rate_hz=1000.0), tmp_path, accept=rows)
+    series = Series(profile, hold(rate_hz=1000.0), tmp_path, accepted_row_names=rows)
     assert [each.name for each in series.plan.offline_check_result.accepted] == rows
     # Nothing else is accepted with it.
     assert "limits.velocity_rad_s" in refusal(

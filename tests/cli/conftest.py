@@ -27,7 +27,7 @@ def run_patched(made_once):
             with pytest.MonkeyPatch.context() as patch, warm_start.children_copied():
                 for target, value in patches.items():
                     patch.setattr(target, value)
-                group = ProcessGroup(live=False, extra_processes=extra_processes)
+                group = ProcessGroup(with_live_view=False, extra_processes=extra_processes)
                 patch.setattr("rigd.cli.run.start_processes", lambda **_: (StopRequest(), group))
                 patch.setattr(
                     "rigd.runtime.ignore_end_signals", lambda **_: None

@@ -153,7 +153,8 @@ class StopAfterOne(StopRequest):
 @pytest.mark.parametrize("repeat", [1, 3])
 def test_stop_between_two_sessions_is_reported(rigd_here, monkeypatch, repeat):
     monkeypatch.setattr(
-        "rigd.cli.run.start_processes", lambda **_: (StopAfterOne(), ProcessGroup(live=False))
+        "rigd.cli.run.start_processes",
+        lambda **_: (StopAfterOne(), ProcessGroup(with_live_view=False)),
     )
     brief = ("--duration", "0.3", "--rest", "0", "--ring-down", "0", "--fast", "--no-look")
     done = rigd_here("run", "hold", *brief, "--repeat", str(repeat), "--json")

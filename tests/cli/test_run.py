@@ -448,7 +448,7 @@ class FolderMoves(StopRequest):
 
 @pytest.mark.usefixtures("children_copied")
 def test_series_without_its_folder_reports_the_earlier_sessions(rigd_here, monkeypatch):
-    processes = FolderMoves(), ProcessGroup(live=False)
+    processes = FolderMoves(), ProcessGroup(with_live_view=False)
     monkeypatch.setattr("rigd.cli.run.start_processes", lambda **_: processes)
     brief = ("--duration", "0.3", "--rest", "0", "--fast", "--no-look")
     done = rigd_here("run", "hold", *brief, "--repeat", "3", "--json")

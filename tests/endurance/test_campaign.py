@@ -37,9 +37,9 @@ def campaign():
 def test_sessions_on_one_connection_leave_no_memory_and_descriptors(campaign, tmp_path):
     profile = load_shipped("sim")
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
-    group = ProcessGroup(live=False)
+    group = ProcessGroup(with_live_view=False)
     control = group[CONTROL].pid
-    rig = Rig(profile, fast=True, group=group)
+    rig = Rig(profile, uses_virtual_clock=True, group=group)
     usages = []
     gc.collect()  # garbage of other tests in this process, which would be freed during the test
     try:

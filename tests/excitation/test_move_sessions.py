@@ -84,7 +84,7 @@ def test_move_starts_at_the_current_angle(profile):
 def test_move_runs_once(profile, tmp_path):
     made = excitation_for(profile, "move", {"by_rad": -0.4}, start_rad=1.2)
     with pytest.raises(RefusedError, match="--repeat 2"):
-        Series(profile, made, tmp_path, repeat=2)
+        Series(profile, made, tmp_path, session_count=2)
 
 
 @pytest.mark.process

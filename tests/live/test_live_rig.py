@@ -33,7 +33,7 @@ def rig(children_copied, profile, runtime_folder, monkeypatch):
     # The duration of the start depends on the machine, and is not tested here.
     monkeypatch.setattr(live_view, "_ADDRESS_TIMEOUT_S", 60.0)
     monkeypatch.setattr(live_view, "_SHOW_TIMEOUT_S", 60.0)
-    rig = Rig(profile, fast=True, live=True)
+    rig = Rig(profile, uses_virtual_clock=True, with_live_view=True)
     rig.connect()
     yield rig
     rig.disconnect()

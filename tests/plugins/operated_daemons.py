@@ -276,7 +276,7 @@ class Operated:
         self.loop = asyncio.new_event_loop()
         self.worker = ThreadPoolExecutor(1)
         self.events = []
-        self.rig = Rig(profile, fast=True)
+        self.rig = Rig(profile, uses_virtual_clock=True)
         self.moving = ActuationTarget.SIMULATED
         self.service = self.world.service = Service(
             self.rig,
@@ -285,7 +285,7 @@ class Operated:
             self.worker,
             self.events.append,
             lambda: self.moving,
-            fast=True,
+            uses_virtual_clock=True,
         )
         self.peer = Peer(1, 100, 0)
 

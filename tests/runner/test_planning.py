@@ -60,7 +60,7 @@ def test_ten_times_the_amplitude_saturates_and_may_be_forced(profile):
     excitation = chirp(rate_hz=1000.0, amplitude_rad=0.25)
     with pytest.raises(RefusedError, match=r"peak torque of 3\.8.* exceeds 0\.9 N·m .*--force"):
         plan_session(profile, excitation)
-    plan = plan_session(profile, excitation, force=True)
+    plan = plan_session(profile, excitation, allows_saturation=True)
     assert any("will be clipped and flagged" in warning for warning in plan.warnings)
     assert not any("--force" in warning for warning in plan.warnings)
 
@@ -91,13 +91,13 @@ def test_predicted_saturation_is_that_of_the_controller(profile):
 )
 def test_largest_amplitude_is_accepted_and_a_larger_one_refused(profile, make, force):
     profile = with_tip_slope(profile, 10.0)
-    largest_rad = largest_amplitude(profile, make(4.0), force=force)
-    assert largest_amplitude(profile, make(1e-3), force=force) == pytest.approx(
+    largest_rad = largest_amplitude(profile, make(4.0), allows_saturation=force)
+    assert largest_amplitude(profile, make(1e-3), allows_saturation=force) == pytest.approx(
         largest_rad, rel=0.01
     )
-    assert not predict_session(profile, make(largest_rad), force=force).refused
+    assert not predict_session(profile, make(largest_rad), allows_saturation=force).refused
     with pytest.raises(RefusedError, match=f"lower the amplitude to {largest_rad:g} rad"):
-        plan_session(profile, make(1.011 * largest_rad), force=force)
+        plan_session(profile, make(1.011 * largest_rad), allows_saturation=force)
 
 
 def test_no_largest_amplitude_without_an_amplitude(profile, tmp_path):
@@ -131,7 +131,7 @@ def test_plan_states_the_direction_of_a_chirp(profile, start_hz, expected):
 
 def test_angle_speed_and_tracking_can_never_be_forced(profile):
     with pytest.raises(RefusedError) as refusal:
-        plan_session(profile, step(rate_hz=1000.0, amplitude_rad=2.0), force=True)
+        plan_session(profile, step(rate_hz=1000.0, amplitude_rad=2.0), allows_saturation=True)
     for key in ("limits.angle_rad", "limits.velocity_rad_s", "limits.tracking_error_rad"):
         assert key in str(refusal.value)
 
@@ -156,7 +156,7 @@ def test_the_sensor_s_range_bounds_the_coupling_torque(profile, projection):
         if refused:
             with pytest.raises(RefusedError, match=r"coupling torque .*sensor\.range"):
                 plan_session(narrow, excitation)
-            assert plan_session(narrow, excitation, force=True).warnings
+            assert plan_session(narrow, excitation, allows_saturation=True).warnings
         else:
             assert plan_session(narrow, excitation).warnings == ()
 
@@ -168,10 +168,10 @@ def test_nan_prediction_is_refused(profile, monkeypatch):
     )
     monkeypatch.setattr(planning, "predict", lambda loop, excitation: broken)
     with pytest.raises(RefusedError, match="nan rad"):
-        plan_session(profile, chirp(rate_hz=1000.0, duration_s=1.0), force=True)
+        plan_session(profile, chirp(rate_hz=1000.0, duration_s=1.0), allows_saturation=True)
 
 
 def test_an_unstable_loop_is_refused(profile):
     without = replace(profile, control=replace(profile.control, feedforward_gain=0.0))
     with pytest.raises(ControlDesignError, match="feedforward_gain"):
-        plan_session(without, chirp(rate_hz=1000.0, duration_s=1.0), force=True)
+        plan_session(without, chirp(rate_hz=1000.0, duration_s=1.0), allows_saturation=True)

@@ -28,7 +28,7 @@ def profile():
 
 @pytest.fixture
 def rig(profile):
-    rig = Rig(profile, fast=True)
+    rig = Rig(profile, uses_virtual_clock=True)
     rig.connect()
     yield rig
     rig.disconnect()
@@ -56,7 +56,7 @@ def descriptors() -> int:
 def test_disconnected_rig_leaves_no_processes_and_descriptors(profile, run):
     gc.collect()  # objects of other tests: their descriptors would be closed later
     before = set(children(os.getpid())), descriptors()
-    rig = Rig(profile, fast=True)
+    rig = Rig(profile, uses_virtual_clock=True)
     assert rig.status() is None
     rig.connect()
     assert run(rig).is_successful

@@ -58,7 +58,7 @@ def make_series(tmp_path):
 
 @pytest.mark.process
 def test_series_ends_with_the_first_failed_session(make_series):
-    series = make_series(repeat=4, notes={"operator": "Ada", "note": ""})
+    series = make_series(session_count=4, notes={"operator": "Ada", "note": ""})
     bad = replace(COMPLETE, outcome="fault")
     rig, listener = Rig(COMPLETE, bad), RecordingListener()
     series.run(rig, StopRequest(), listener, with_live_view=True)
@@ -93,7 +93,9 @@ def test_single_session_is_not_numbered(make_series):
 def test_seeds_of_a_series_follow_from_the_stated_seed(make_series):
     def seeds():
         rig = Rig(*[COMPLETE] * 3)
-        make_series(repeat=3).run(rig, StopRequest(), RecordingListener(), with_live_view=False)
+        make_series(session_count=3).run(
+            rig, StopRequest(), RecordingListener(), with_live_view=False
+        )
         return [order.seed for order in rig.orders]
 
     assert seeds()[0] == 1
@@ -110,13 +112,13 @@ def test_no_shipped_profile_states_a_seed():
 def test_no_session_begins_after_a_stop(make_series):
     stop, listener = StopRequest(), RecordingListener()
     stop.request()
-    make_series(repeat=2).run(Rig(), stop, listener, with_live_view=False)
+    make_series(session_count=2).run(Rig(), stop, listener, with_live_view=False)
     assert listener.calls == []
 
 
 @pytest.mark.process
 def test_full_disk_retains_the_results_so_far(make_series, tmp_path):
-    series = make_series(repeat=3)
+    series = make_series(session_count=3)
 
     class RigWithFullDisk(Rig):
         def run(self, *order):
@@ -170,7 +172,7 @@ def test_quick_look_is_suspended_during_a_session(make_series):
     stopped = replace(COMPLETE, path=None)
     results = (replace(COMPLETE, path=Path(f"a-0{number}.mcap")) for number in (1, 2))
     queue = FakeQuickLookQueue(listener.calls)
-    series = make_series(repeat=3)
+    series = make_series(session_count=3)
     series.run(
         WatchedRig(*results, stopped),
         StopRequest(),
@@ -197,7 +199,7 @@ def test_stop_ends_the_wait_for_a_quick_look(make_series):
 
     queue = FakeQuickLookQueue(listener.calls)
     result = replace(COMPLETE, path=Path("a-01.mcap"))
-    make_series(repeat=3).run(
+    make_series(session_count=3).run(
         StoppingRig(result), stop, listener, with_live_view=False, quick_looks=queue
     )
     names = [each if isinstance(each, str) else each[0] for each in listener.calls]

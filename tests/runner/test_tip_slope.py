@@ -31,14 +31,16 @@ MAKE = {
 def test_identification_beyond_the_limit_is_refused_with_remedies(profile, kind):
     """The message has value, limit, largest amplitude and override; both remedies work."""
     excitation = MAKE[kind](0.12)
-    refused = predict_session(profile, excitation, force=True).refused  # no torque is concerned
+    refused = predict_session(
+        profile, excitation, allows_saturation=True
+    ).refused  # no torque is concerned
     (line,) = [each for each in refused.splitlines() if "tip slope" in each]
     slope_rad, limit_rad = map(float, re.search(r"of (\S+) rad exceeds (\S+) rad", line).groups())
     assert slope_rad > limit_rad == SMALL_SLOPE_RAD
     assert "(limits.tip_slope_rad)" in line
     lower_rad = float(re.search(r"lower the amplitude to (\S+) rad", line)[1])
-    assert lower_rad == largest_amplitude(profile, excitation, force=True)
-    lower = predict_session(profile, MAKE[kind](lower_rad), force=True)
+    assert lower_rad == largest_amplitude(profile, excitation, allows_saturation=True)
+    lower = predict_session(profile, MAKE[kind](lower_rad), allows_saturation=True)
     assert 0.95 * limit_rad < lower.prediction.tip.slope_rad <= limit_rad
     assert not lower.refused
     allowed_rad = float(re.search(r"--tip-slope (\S+)", line)[1])

@@ -49,7 +49,7 @@ def test_no_hardware_motion_with_a_simulation_elsewhere(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with pytest.raises(RefusedError, match=rf"XDG_RUNTIME_DIR={runtime_folder} .*--hardware"):
         load_rig(profile)
-    assert load_rig(profile, hardware=True)[1] is ActuationTarget.HARDWARE
+    assert load_rig(profile, force_hardware=True)[1] is ActuationTarget.HARDWARE
     process.terminate()
     process.wait()
     assert load_rig(profile)[1] is ActuationTarget.HARDWARE
@@ -91,7 +91,7 @@ def test_other_and_dead_simulated_rigs_are_ignored(profile, runtime_folder):
 @pytest.mark.process
 def test_error_if_hardware_is_requested_for_a_simulated_rig(start_simulator, profile):
     with pytest.raises(RefusedError, match="--hardware: No hardware: sim is simulated"):
-        load_rig("sim", hardware=True)
+        load_rig("sim", force_hardware=True)
     start_simulator(profile)
     with pytest.raises(RefusedError, match=r"--hardware: .*by the clock"):
-        load_rig(profile, hardware=True)
+        load_rig(profile, force_hardware=True)

@@ -74,7 +74,7 @@ def run_order(children_copied, tmp_path):
             excitation=excitation,
             path=tmp_path / f"{name}.mcap",
         )
-        rig = Rig(profile, fast=fast)
+        rig = Rig(profile, uses_virtual_clock=fast)
         try:
             rig.connect()
             return rig.run(order, StopRequest(), watch)

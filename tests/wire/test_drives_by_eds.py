@@ -36,7 +36,7 @@ def test_a_drive_with_torque_mode_runs_again_after_a_fault(
 def test_a_drive_without_torque_mode_is_refused_by_name(quiet_profile, start_simulator, load):
     path = quiet_profile("antenna_can")
     start_simulator(path, "--lock-step", "--eds", eds_path("pilz_prbt"))
-    rig = Rig(load(path), fast=True)
+    rig = Rig(load(path), uses_virtual_clock=True)
     begun = time.monotonic()
     with pytest.raises(RigError, match="no cyclic synchronous torque mode"):
         rig.connect()

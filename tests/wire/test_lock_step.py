@@ -96,7 +96,7 @@ def test_a_rig_may_be_idle_between_sessions(quiet_profile, start_simulator, load
     profile = load(quiet_profile("antenna_can", {"cia402.enable_timeout_s": "0.1"}))
     start_simulator(profile.path, "--lock-step")
     excitation = hold(rate_hz=1000.0, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)
-    rig = Rig(profile, fast=True)
+    rig = Rig(profile, uses_virtual_clock=True)
 
     def run(name):
         order = SessionOrder(profile, excitation, tmp_path / f"{name}.mcap")

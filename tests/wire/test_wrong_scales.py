@@ -63,7 +63,7 @@ def rig_on_wire(write_profile, start_simulator, load, tmp_path):
         messages = OperatorMessages(stop if stopped else None)
         excitation = hold(rate_hz=1000.0, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)
         series = Series(profile, excitation, tmp_path / "sessions", **options)
-        rig = Rig(profile, fast=True)
+        rig = Rig(profile, uses_virtual_clock=True)
         rigs.append(rig)
         rig.connect()
         try:
