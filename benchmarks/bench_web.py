@@ -30,7 +30,7 @@ from bench_live import cpu_s
 from gate import Gate, Row
 
 from rigd.daemon import page_address
-from rigd.daemon.address import find
+from rigd.daemon.address import find_daemon_socket
 from rigd.daemon.client import Client
 from rigd.session import read_session
 
@@ -112,7 +112,7 @@ def opened_pages(address: str, pages: int, out: Path) -> Iterator[subprocess.Pop
 
 def run(seconds: float, folder: Path, pages: int) -> Found:
     """Run one chirp with a number of open pages; of several, one is suspended."""
-    daemon = find("sim")
+    daemon = find_daemon_socket("sim")
     address = str(page_address("sim")).partition("#")[0]
     came = folder / "strips.txt"
     came.touch()
@@ -143,7 +143,9 @@ def run(seconds: float, folder: Path, pages: int) -> Found:
                 for each, at in zip(watched, before, strict=True)
             ]
             memory = [pss_mb(each) for each in watched]
-            while (event := client.event(_PATIENCE_S)) is None or event.get("event") != "series":
+            while (event := client.next_event(_PATIENCE_S)) is None or event.get(
+                "event"
+            ) != "series":
                 pass
         finally:
             for opening in reversed(openings):
@@ -191,7 +193,7 @@ def served(folder: Path) -> Iterator[None]:
             deadline_s = time.monotonic() + _PATIENCE_S
             while page_address("sim") is None and time.monotonic() < deadline_s:
                 time.sleep(0.2)
-            with Client(find("sim")) as client:
+            with Client(find_daemon_socket("sim")) as client:
                 while client.ask("status")["state"] != "ready":
                     time.sleep(0.2)
             yield

@@ -109,19 +109,21 @@ def daemon_client(profile: str | None) -> "Iterator[Client]":
 
 def _socket_path(profile: str | None) -> "Path":
     """Return the path of the control socket of a profile's daemon, or of the only running one."""
-    from rigd.daemon.address import find
+    from rigd.daemon.address import find_daemon_socket
 
-    return find(rig_name(profile))
+    return find_daemon_socket(rig_name(profile))
 
 
 def rig_name(profile: str | None) -> str | None:
     """Return the name of a profile's rig, which identifies its daemon; None without profile."""
     if profile is None:
         return None
-    from rigd.daemon.address import running, socket_path
+    from rigd.daemon.address import running_daemon_sockets, socket_path
 
     # Reading a profile is slow, and unnecessary if a daemon of that name is running.
-    if any(profile_path.name == socket_path(profile).name for profile_path in running()):
+    if any(
+        profile_path.name == socket_path(profile).name for profile_path in running_daemon_sockets()
+    ):
         return profile
     from rigd.cli.options import profile_named
 
@@ -175,7 +177,7 @@ def stop(
     """
     from rigd.cli.stop_report import stop_and_report
 
-    exit_code = stop_and_report(profile, wait=not no_wait)
+    exit_code = stop_and_report(profile, is_end_awaited=not no_wait)
     if exit_code:
         raise typer.Exit(exit_code)
 
@@ -219,11 +221,11 @@ def reset_by_daemon(profile: str | None) -> bool:
 
     Return False if the rig has no daemon. Without a profile, the command ends then.
     """
-    from rigd.daemon.address import AddressError, find
+    from rigd.daemon.address import AddressError, find_daemon_socket
     from rigd.daemon.client import Client
 
     try:
-        daemon_socket = find(rig_name(profile))
+        daemon_socket = find_daemon_socket(rig_name(profile))
     except AddressError as error:
         if profile is not None:
             return False
@@ -256,7 +258,7 @@ def _watch_status(profile: str | None) -> None:
     from rich.live import Live
 
     from rigd.cli.status_view import status_table
-    from rigd.daemon.address import find
+    from rigd.daemon.address import find_daemon_socket
     from rigd.daemon.client import Client
 
     wanted_rig_name = rig_name(profile)
@@ -267,7 +269,7 @@ def _watch_status(profile: str | None) -> None:
         connected_client: Client | None = client
         while True:
             try:
-                connected_client = connected_client or Client(find(wanted_rig_name))
+                connected_client = connected_client or Client(find_daemon_socket(wanted_rig_name))
                 daemon_reply = connected_client.ask("status")
                 wanted_rig_name = wanted_rig_name or daemon_reply["daemon"]["profile"]
                 live_display.update(status_table(daemon_reply), refresh=True)

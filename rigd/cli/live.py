@@ -113,9 +113,9 @@ def live(
 
 def _rig_name(profile: str) -> str:
     """Return the name of the rig of a profile; an invalid profile ends the command."""
-    from rigd.daemon.client import find_views
+    from rigd.daemon.client import find_live_views
 
-    if find_views(profile):
+    if find_live_views(profile):
         return profile
     from rigd.cli.options import profile_named
 
@@ -127,9 +127,9 @@ def _only_running_view(rig_name: str | None) -> "LiveAddress | None":
 
     Several live views end the command.
     """
-    from rigd.daemon.client import find_views
+    from rigd.daemon.client import find_live_views
 
-    live_views = find_views(rig_name)
+    live_views = find_live_views(rig_name)
     if len(live_views) > 1:
         rig_names = ", ".join(live_view.rig for live_view in live_views)
         fail(f"Several live views are running ({rig_names}); name one with --profile.", EXIT_FAILED)
@@ -146,11 +146,11 @@ def _wait_for_view(rig_name: str | None) -> "LiveAddress":
 
 def _start_advice(profile: str | None) -> str:
     """Return the message that no live view is running, with the command that starts one."""
-    from rigd.daemon.client import daemons
+    from rigd.daemon.client import daemons_with_view
 
     rig_text = "" if profile is None else f" of the rig {profile}"
     profile_name = profile or "NAME"
-    for rig, has_view in daemons().items():
+    for rig, has_view in daemons_with_view().items():
         if profile not in (None, rig):
             continue
         if has_view:
@@ -194,12 +194,12 @@ def _follow_servers(viewer: "Viewer", view: "LiveAddress") -> int:
 
     Returns the exit code of the viewer.
     """
-    from rigd.daemon.client import find_views
+    from rigd.daemon.client import find_live_views
 
     is_view_running = True
     while (exit_code := viewer.exit_code) is None:
         time.sleep(_POLL_PERIOD_S)
-        live_view = next(iter(find_views(view.rig)), None)
+        live_view = next(iter(find_live_views(view.rig)), None)
         if live_view is not None and live_view.server != view.server:
             if not viewer.connect(live_view):
                 continue  # tried again in the next round

@@ -242,7 +242,7 @@ def _follow_series(
                 )
             if final_event is None and interrupts.count > 1:
                 raise typer.Exit(EXIT_INTERRUPTED)
-            daemon_event = client.event(_EVENT_TIMEOUT_S) or {}
+            daemon_event = client.next_event(_EVENT_TIMEOUT_S) or {}
             match daemon_event.get("event"):
                 # No bar between two sessions, where it would mix with the printed path.
                 case "progress" if daemon_event["session"] > ended_session_count:

@@ -5,7 +5,7 @@ import sys
 from typing import Any
 
 from rigd.cli.entry import EXIT_FAILED, EXIT_WRONG_USE, run_command
-from rigd.daemon.address import find
+from rigd.daemon.address import find_daemon_socket
 from rigd.daemon.client import Client
 from rigd.errors import RigdError
 from rigd.printable import readable_message
@@ -19,7 +19,7 @@ def main() -> None:
 def _request_and_report() -> None:
     """Print the status of the only running daemon."""
     try:
-        with Client(find(None)) as client:
+        with Client(find_daemon_socket(None)) as client:
             daemon_reply = client.ask("status")
     except RigdError as error:
         sys.stderr.write(f"Error: {readable_message(error.full_message())}\n")

@@ -14,7 +14,7 @@ from typing import Final
 
 LOGGER_NAME: Final = "rigd.serve"
 """Name of the daemon's logger."""
-_MAX_WAITING_RECORDS: Final = 1000
+_MAX_WAITING_LOG_RECORDS: Final = 1000
 """Maximum number of log records that wait to be written."""
 _STANDARD_ERROR_FD: Final = 2
 """File descriptor of standard error."""
@@ -48,7 +48,7 @@ class DaemonLog:
     """Context in which a thread writes the records of the daemon's logger to standard error."""
 
     def __init__(self) -> None:
-        self._queue: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_WAITING_RECORDS)
+        self._queue: queue.Queue[logging.LogRecord] = queue.Queue(_MAX_WAITING_LOG_RECORDS)
         self._handler = _DroppingQueueHandler(self._queue)
 
     def __enter__(self) -> None:

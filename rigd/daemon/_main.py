@@ -13,7 +13,7 @@ from rigd.daemon._log import LOGGER_NAME, DaemonLog
 from rigd.daemon._server import Server
 from rigd.daemon._service import Service
 from rigd.daemon._states import resolve_user
-from rigd.daemon.address import GROUP_FOLDER, bind, socket_path
+from rigd.daemon.address import GROUP_FOLDER, bind_daemon_socket, socket_path
 from rigd.devices import (
     ActuationTarget,
     actuation_target,
@@ -32,7 +32,7 @@ _log = logging.getLogger(LOGGER_NAME)
 
 def run_daemon(
     profile: Profile,
-    folder: Path,
+    session_folder: Path,
     *,
     group_name: str | None,
     with_live_view: bool,
@@ -47,7 +47,7 @@ def run_daemon(
     ----------
     profile
         Profile of the rig.
-    folder
+    session_folder
         Folder of the session files.
     group_name
         Group of users who may operate the rig through the daemon, in addition to this user.
@@ -80,14 +80,14 @@ def run_daemon(
             RigLock(profile.name, "rigd serve", hardware=target is ActuationTarget.HARDWARE)
         )
         daemon_socket = socket_path(profile.name, None if group_name is None else GROUP_FOLDER)
-        listener = resources.enter_context(bind(daemon_socket, group_name))
+        listener = resources.enter_context(bind_daemon_socket(daemon_socket, group_name))
         resources.callback(daemon_socket.unlink, missing_ok=True)
         rig_worker = resources.enter_context(ThreadPoolExecutor(1, "rig"))
         server = Server(listener)
         service = Service(
             Rig(profile, uses_virtual_clock=uses_virtual_clock, with_live_view=with_live_view),
             profile,
-            folder,
+            session_folder,
             rig_worker,
             server.publish,
             partial(actuation_target, profile.rig),
@@ -104,7 +104,7 @@ def run_daemon(
             from rigd.daemon._page import PageProcess
 
             page_process = PageProcess(
-                profile, folder, daemon_socket, page_port, service.set_page_address
+                profile, session_folder, daemon_socket, page_port, service.set_page_address
             )
             resources.callback(page_process.close)
         return asyncio.run(_run_until_signal(server, service))

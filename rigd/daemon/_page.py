@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 PAGE_PORT: Final = 8720
 """Default port of the page on the loopback interface."""
-_SUCCESSFUL_RUN_S: Final = 60.0
+_MIN_SUCCESSFUL_RUN_S: Final = 60.0
 """Run time in seconds above which a start of the process counts as successful."""
 _RESTART_PAUSE_S: Final = 1.0
 """Pause in seconds before the process is started again."""
@@ -52,13 +52,13 @@ class PageProcess:
     def __init__(
         self,
         profile: "Profile",
-        folder: Path,
-        socket: Path,
+        session_folder: Path,
+        daemon_socket_path: Path,
         port: int | None,
         on_address: Callable[[str | None], None],
     ) -> None:
         self._token = secrets.token_urlsafe(24)
-        self._job = _page_job(profile, folder, socket) | {
+        self._job = _page_job(profile, session_folder, daemon_socket_path) | {
             "token": self._token,
             "port": PAGE_PORT if port is None else port,
             "any_port": port is None,
@@ -85,12 +85,12 @@ class PageProcess:
         short_run_count = 0
         while short_run_count <= PAGE.restarts:
             short_run_count += 1
-            began_s = time.monotonic()
+            run_begin_s = time.monotonic()
             try:
                 self._run_process()
             except ChildError as error:
                 _log.warning("page: its process cannot be started (%s)", error.system_reason)
-            if time.monotonic() - began_s >= _SUCCESSFUL_RUN_S:
+            if time.monotonic() - run_begin_s >= _MIN_SUCCESSFUL_RUN_S:
                 short_run_count = 0
             self._on_address(None)
             if self._is_closing.wait(_RESTART_PAUSE_S):
@@ -108,7 +108,7 @@ class PageProcess:
             while True:
                 match page_process.poll(None):
                     case PageAddress(port):
-                        self._announce(port)
+                        self._announce_page(port)
                     case ProcessFailed(failure_text):
                         pass
         except (ChildError, ValueError):  # it has ended, or its input was closed
@@ -118,30 +118,30 @@ class PageProcess:
                 "page: its process ended with code %s: %s", page_process.exit_code, failure_text
             )
 
-    def _announce(self, port: int) -> None:
+    def _announce_page(self, port: int) -> None:
         """Announce the page's address, and store the port, which a restarted process uses again."""
         self._job["port"] = port
-        url = f"http://127.0.0.1:{port}/"
+        page_url = f"http://127.0.0.1:{port}/"
         pid = os.getpid()
         write_address(
             self._address_path,
-            {"pid": pid, "born": process_start_ticks(pid), "url": url, "token": self._token},
+            {"pid": pid, "born": process_start_ticks(pid), "url": page_url, "token": self._token},
         )
-        self._on_address(url)
+        self._on_address(page_url)
         # The token is printed only on a terminal, because other users may read the journal.
-        printed_url = f"{url}#token={self._token}" if sys.stderr.isatty() else url
+        printed_url = f"{page_url}#token={self._token}" if sys.stderr.isatty() else page_url
         _log.info("page: %s (rigd status shows the address with its token)", printed_url)
 
 
-def page_address(rig: str) -> str | None:
+def page_address(rig_name: str) -> str | None:
     """Return the URL, with token, of the page of a rig's daemon; None if it is not served.
 
     Parameters
     ----------
-    rig
+    rig_name
         Name of the rig's profile.
     """
-    address_document = read_address(_address_path(rig))
+    address_document = read_address(_address_path(rig_name))
     pid, start_ticks, url, token = (
         address_document.get(address_key) for address_key in ("pid", "born", "url", "token")
     )
@@ -150,17 +150,17 @@ def page_address(rig: str) -> str | None:
     return f"{url}#token={token}" if process_start_ticks(pid) == start_ticks else None
 
 
-def _address_path(rig: str) -> Path:
+def _address_path(rig_name: str) -> Path:
     """Return the path of the file with the address and the token of a rig's page."""
-    return runtime_folder() / f"page-{file_name(rig)}.json"
+    return runtime_folder() / f"page-{file_name(rig_name)}.json"
 
 
-def _page_job(profile: "Profile", folder: Path, socket: Path) -> dict[str, Any]:
+def _page_job(profile: "Profile", session_folder: Path, daemon_socket_path: Path) -> dict[str, Any]:
     """Return the first message to the page's process: what it needs in addition to the status."""
     rig = profile.rig
     return {
-        "socket": str(socket),
-        "folder": str(folder),
+        "socket": str(daemon_socket_path),
+        "folder": str(session_folder),
         "profile": profile.name,
         "description": profile.description,
         "rate_hz": rig.rate_hz,

@@ -32,13 +32,13 @@ _MAX_ACCEPTED_ROWS = 32
 """Maximum number of checks that a request may accept as failed."""
 Note = Annotated[str, Field(max_length=1000)]
 RowName = Annotated[str, Field(max_length=_MAX_ID_CHARACTERS)]
-Id = int | Annotated[str, Field(max_length=_MAX_ID_CHARACTERS)]
+RequestId = int | Annotated[str, Field(max_length=_MAX_ID_CHARACTERS)]
 
 
 class RequestError(Exception):
     """Raised if a request is invalid; the message states why, and `request_id` which request."""
 
-    def __init__(self, message: str, request_id: Id | None = None) -> None:
+    def __init__(self, message: str, request_id: RequestId | None = None) -> None:
         super().__init__(message)
         self.request_id = request_id
 
@@ -57,11 +57,11 @@ class Request(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    controlling: ClassVar[bool] = False
+    is_controlling: ClassVar[bool] = False
     """Whether only the client that controls the rig may send the request."""
 
     command: str
-    id: Id | None = None
+    id: RequestId | None = None
 
 
 class StatusRequest(Request):
@@ -86,21 +86,21 @@ class StopSessionRequest(Request):
 class TareRequest(Request):
     """Request to tare the force-torque sensor: its mean reading at rest becomes zero."""
 
-    controlling = True
+    is_controlling = True
     command: Literal["tare"]
 
 
 class ZeroRequest(Request):
     """Request to set the present motor angle as the rig's zero."""
 
-    controlling = True
+    is_controlling = True
     command: Literal["zero"]
 
 
 class ResetRequest(Request):
     """Request to reset a fault of the rig."""
 
-    controlling = True
+    is_controlling = True
     command: Literal["reset"]
 
 
@@ -130,7 +130,7 @@ class Notes(BaseModel):
 class CheckRequest(Request):
     """Request to check profile, control loop, computer, and data that the devices have reported."""
 
-    controlling = True
+    is_controlling = True
     command: Literal["check"]
 
 
@@ -150,7 +150,7 @@ class SessionRequest(Request):
 class StartRequest(SessionRequest):
     """Request to run a session or a series of sessions."""
 
-    controlling = True
+    is_controlling = True
     command: Literal["start"]
 
 
@@ -171,7 +171,7 @@ AnyRequest = (
     | StartRequest
     | PredictRequest
 )
-_REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(
+_REQUEST_VALIDATOR: TypeAdapter[AnyRequest] = TypeAdapter(
     Annotated[AnyRequest, Field(discriminator="command")]
 )
 _COMMAND_NAMES = "status", "watch", "stop", "tare", "zero", "reset", "check", "start", "predict"
@@ -194,7 +194,7 @@ def parse_request(request_line: bytes) -> AnyRequest:
             request_id,
         )
     try:
-        parsed_request = _REQUESTS.validate_python(request_document)
+        parsed_request = _REQUEST_VALIDATOR.validate_python(request_document)
     except ValidationError as error:
         raise RequestError(_first_error_sentence(error), request_id) from None
     try:
@@ -265,22 +265,22 @@ def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
     given_parameters = dict(request.parameters)
     # Older clients send it among the parameters of `until`.
     if request.tip_slope_rad is None and "tip_slope_rad" in given_parameters:
-        slope_rad = _finite_number("tip_slope_rad", given_parameters.pop("tip_slope_rad"))
-        if slope_rad <= 0.0:
-            raise RequestError(f"tip_slope_rad = {slope_rad:g} rad must be more than 0 rad.")
-        checked_fields["tip_slope_rad"] = slope_rad
-    options = {option.name: option for option in excitation_options(request.excitation)}
+        tip_slope_rad = _finite_number("tip_slope_rad", given_parameters.pop("tip_slope_rad"))
+        if tip_slope_rad <= 0.0:
+            raise RequestError(f"tip_slope_rad = {tip_slope_rad:g} rad must be more than 0 rad.")
+        checked_fields["tip_slope_rad"] = tip_slope_rad
+    option_by_name = {option.name: option for option in excitation_options(request.excitation)}
     checked_values: dict[str, Value] = {}
     for parameter_name, given_value in given_parameters.items():
-        if parameter_name not in options:
+        if parameter_name not in option_by_name:
             raise RequestError(
                 f"parameters: {_shown_value(parameter_name)} is not a parameter of "
-                f"{request.excitation}; choose from {', '.join(options)}."
+                f"{request.excitation}; choose from {', '.join(option_by_name)}."
             )
         checked_values[parameter_name] = _converted_parameter(
-            parameter_name, given_value, options[parameter_name].value_type
+            parameter_name, given_value, option_by_name[parameter_name].value_type
         )
-    for option in options.values():
+    for option in option_by_name.values():
         if option.required and option.name not in checked_values:
             raise RequestError(f"parameters.{option.name} is missing.")
     return request.model_copy(update={**checked_fields, "parameters": checked_values})
@@ -326,12 +326,12 @@ def _converted_parameter(parameter_name: str, given_value: object, wanted_type: 
 
 def _finite_number(parameter_name: str, given_value: object) -> float:
     """Return a parameter as a finite number; raise RequestError if it is not one."""
-    number = finite_number(given_value)
-    if number is None:
+    finite_value = finite_number(given_value)
+    if finite_value is None:
         raise RequestError(
             f"parameters.{parameter_name} = {_shown_value(given_value)} is not a finite number."
         )
-    return number
+    return finite_value
 
 
 def _shown_value(json_value: object) -> str:

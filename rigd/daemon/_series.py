@@ -32,27 +32,27 @@ _log = logging.getLogger(LOGGER_NAME)
 class ServedSeries:
     """Series of sessions that a client requested, and its progress."""
 
-    number: int
+    series_number: int
     """Number of the series since the daemon was started."""
     request: protocol.StartRequest
     """Request of the client."""
-    stop: StopRequest = field(default_factory=StopRequest)
+    stop_request: StopRequest = field(default_factory=StopRequest)
     """Flag that states whether a stop of the series was requested."""
-    planned: Series | None = None
+    planned_series: Series | None = None
     """Planned series, or None before the planning is complete."""
-    session: int = 0
+    session_number: int = 0
     """Number of the present session, from 1."""
-    path: Path | None = None
+    session_path: Path | None = None
     """Path of the present session's file."""
-    fit: Document | None = None
+    last_fit: Document | None = None
     """Last fit of the present session's record."""
-    results: list[SessionResult] = field(default_factory=list)
+    session_results: list[SessionResult] = field(default_factory=list)
     """Results of the sessions so far, including a failed session."""
-    reason: str = ""
+    end_reason: str = ""
     """Sentence that states why the series ended early; empty if it did not."""
-    running: bool = False
+    is_running: bool = False
     """Whether the series is being planned or run."""
-    failed: bool = False
+    has_failed: bool = False
     """Whether the series failed, so that sessions are missing or incomplete."""
 
     @property
@@ -63,20 +63,20 @@ class ServedSeries:
     def as_document(self) -> Document:
         """Return the series and its progress as a dictionary for JSON."""
         return {
-            "series": self.number,
+            "series": self.series_number,
             "excitation": self.request.excitation,
-            "session": self.session,
+            "session": self.session_number,
             "repeat": self.request.repeat,
             "notes": self.request.notes.model_dump(exclude_defaults=True),
-            "plan": None if self.planned is None else self.planned.plan_document(),
-            "path": None if self.path is None else str(self.path),
-            "running": self.running,
-            "stopped": self.stop.requested,
-            "failed": self.failed,
-            "reason": self.reason,
-            "fit": self.fit,
+            "plan": None if self.planned_series is None else self.planned_series.plan_document(),
+            "path": None if self.session_path is None else str(self.session_path),
+            "running": self.is_running,
+            "stopped": self.stop_request.requested,
+            "failed": self.has_failed,
+            "reason": self.end_reason,
+            "fit": self.last_fit,
             # The fits are left out, because they would double the size of the document.
-            "sessions": [replace(result, fit=None).as_dict() for result in self.results],
+            "sessions": [replace(result, fit=None).as_dict() for result in self.session_results],
         }
 
     def state_after(self, fault_reason: str) -> tuple[DaemonState, str]:
@@ -86,10 +86,10 @@ class ServedSeries:
         """
         if fault_reason:
             return DaemonState.FAULT, fault_reason
-        if self.stop.requested:
+        if self.stop_request.requested:
             return DaemonState.READY, f"{self.description} was stopped"
-        if self.reason:
-            return DaemonState.READY, self.reason
+        if self.end_reason:
+            return DaemonState.READY, self.end_reason
         return DaemonState.READY, f"{self.description} is complete"
 
 
@@ -118,16 +118,16 @@ class SeriesReporter:
         self._publish = publish
         self._can_receive_stop = can_receive_stop
 
-    def on_start(self, number: int, path: Path) -> None:
+    def on_start(self, session_number: int, session_path: Path) -> None:
         if not self._can_receive_stop():
             raise RigError(
                 "The daemon does not respond to requests: no further session is started."
             )
-        self._series.session, self._series.path = number, path
-        self._series.fit = None
+        self._series.session_number, self._series.session_path = session_number, session_path
+        self._series.last_fit = None
 
     def on_message(self, level: str, text: str) -> None:
-        self._report(level, text, notable=True)
+        self._report(level, text, is_notable=True)
 
     def on_live_view(self, view_text: str) -> None:
         self._report("info", view_text)
@@ -135,42 +135,44 @@ class SeriesReporter:
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         for event in events:
             if event.level in _LOGGING_LEVELS:
-                self._report(event.level, event.message, notable=event.notable)
+                self._report(event.level, event.message, is_notable=event.notable)
         for fit in progress.fits:
             self._report_fit(fit)
 
     def on_result(self, result: SessionResult, *, look_follows: bool) -> None:
         series = self._series
-        series.results.append(result)
+        series.session_results.append(result)
         fit_entry = {}
         if result.fit is not None:
             # The result's fit lacks temporary data, such as the text for the operator.
-            series.fit = (series.fit or {}) | fit_document(result.fit)
-            fit_entry = {"fit": series.fit}
+            series.last_fit = (series.last_fit or {}) | fit_document(result.fit)
+            fit_entry = {"fit": series.last_fit}
         outcome_line = result_line(result.as_dict())
         _log.log(
             logging.INFO if result.is_successful else logging.WARNING,
             "series %d: session %d of %d, %s: %s",
-            series.number,
-            series.session,
+            series.series_number,
+            series.session_number,
             series.request.repeat,
             result.path or result.part or "no file",
             outcome_line,
         )
         # This event has the text of the terminal, for clients that list events.
         event_level = _OUTCOME_LEVELS.get(result.outcome, "error")
-        log_message = {"level": event_level, "text": outcome_line, "session": series.session}
+        log_message = {"level": event_level, "text": outcome_line, "session": series.session_number}
         self._publish({"event": "message", **log_message})
         result_document = result.as_dict() | fit_entry | {"look_follows": look_follows}
-        self._publish({"event": "session", "number": series.session, **result_document})
+        self._publish({"event": "session", "number": series.session_number, **result_document})
 
-    def _report(self, level: str, text: str, *, notable: bool = False) -> None:
+    def _report(self, event_level: str, message_text: str, *, is_notable: bool = False) -> None:
         """Log a message on the series, and publish it as an event."""
-        _log.log(_LOGGING_LEVELS[level], "series %d: %s", self._series.number, text)
-        log_message = {"level": level, "text": text, "notable": notable}
+        _log.log(
+            _LOGGING_LEVELS[event_level], "series %d: %s", self._series.series_number, message_text
+        )
+        log_message = {"level": event_level, "text": message_text, "notable": is_notable}
         self._publish({"event": "message", **log_message})
 
     def _report_fit(self, fit: Mapping[str, Any]) -> None:
         """Store a fit of the present record, and publish it as an event."""
-        published_fit = self._series.fit = fit_document(fit)
-        self._publish({"event": "fit", "session": self._series.session, **published_fit})
+        published_fit = self._series.last_fit = fit_document(fit)
+        self._publish({"event": "fit", "session": self._series.session_number, **published_fit})

@@ -26,15 +26,15 @@ from rigd.daemon._protocol import (
     MAX_LINE_BYTES,
     AnyRequest,
     CommandError,
-    Id,
     RequestError,
+    RequestId,
     StopSessionRequest,
     WatchRequest,
     parse_request,
 )
 from rigd.daemon._service import Service
 from rigd.daemon._states import Document, Peer, resolve_user
-from rigd.daemon.address import peer_of
+from rigd.daemon.address import peer_pid_and_uid
 
 MAX_CLIENTS = 32
 """Maximum number of clients."""
@@ -45,10 +45,10 @@ MAX_PENDING_CONNECTIONS = 64
 """Maximum number of connections that have not sent a complete line yet."""
 _LISTEN_BACKLOG = 128
 """Maximum number of connections that wait to be accepted."""
-_ACCEPTS_PER_ROUND = 64
+_MAX_ACCEPTED_CONNECTIONS = 64
 """Number of connections that are accepted before a pause."""
 _ACCEPT_PAUSE_S = 0.001
-"""Pause in seconds after `_ACCEPTS_PER_ROUND` connections, which leaves time for other work."""
+"""Pause in seconds after `_MAX_ACCEPTED_CONNECTIONS` connections, for other work."""
 _MIN_REQUEST_INTERVAL_S = 0.005
 """Minimum time in seconds between two requests of a client."""
 _MAX_UNREAD_BYTES = 262_144
@@ -101,14 +101,14 @@ class Server:
         self._listener.close()
         for pending_connection in list(self._pending_connections.values()):
             self._forget_pending(pending_connection)
-            pending_connection.link.close()
+            pending_connection.client_socket.close()
         for client in list(self._clients):
             self._disconnect_when_sent(client)
         while self._leaving_clients:  # takes at most `_CLOSE_TIMEOUT_S`
             await asyncio.sleep(0.01)
         self._release_spare_fd()
 
-    def remove(self, client: "_ClientConnection") -> None:
+    def remove_client(self, client: "_ClientConnection") -> None:
         """Remove a client whose connection was lost."""
         self._clients.discard(client)
         self._leaving_clients.discard(client)
@@ -131,8 +131,8 @@ class Server:
             asyncio.get_running_loop().add_reader(self._listener, self._accept_connections)
 
     def _accept_connections(self) -> None:
-        """Accept waiting connections; after `_ACCEPTS_PER_ROUND` of them, pause for a moment."""
-        for _ in range(_ACCEPTS_PER_ROUND):
+        """Accept waiting connections; pause briefly after `_MAX_ACCEPTED_CONNECTIONS` of them."""
+        for _ in range(_MAX_ACCEPTED_CONNECTIONS):
             try:
                 new_socket, _ = self._listener.accept()
             except BlockingIOError:
@@ -159,24 +159,24 @@ class Server:
     def _identified_connection(self, new_socket: socket.socket) -> "_PendingConnection":
         """Return an accepted connection with its number, process id and user id."""
         new_socket.setblocking(False)
-        pid, uid = peer_of(new_socket)
+        pid, uid = peer_pid_and_uid(new_socket)
         self._connection_count += 1
         return _PendingConnection(new_socket, Peer(self._connection_count, pid, uid))
 
     def _receive(self, pending_connection: "_PendingConnection") -> None:
         """Read from a new connection, which becomes a client when its first line is complete."""
         try:
-            received_bytes = pending_connection.link.recv(MAX_LINE_BYTES)
+            received_bytes = pending_connection.client_socket.recv(MAX_LINE_BYTES)
         except BlockingIOError:
             self._await_line(pending_connection)
             return
         except OSError:
             received_bytes = b""
-        pending_connection.received += received_bytes
+        pending_connection.received_bytes += received_bytes
         if (
             received_bytes
-            and b"\n" not in pending_connection.received
-            and len(pending_connection.received) < MAX_LINE_BYTES
+            and b"\n" not in pending_connection.received_bytes
+            and len(pending_connection.received_bytes) < MAX_LINE_BYTES
         ):
             self._await_line(pending_connection)
             return
@@ -184,17 +184,17 @@ class Server:
         if received_bytes:
             self._make_client(pending_connection)
         else:
-            pending_connection.link.close()
+            pending_connection.client_socket.close()
 
     def _await_line(self, pending_connection: "_PendingConnection") -> None:
         """Wait for more data of a connection; if too many are waiting, close the oldest."""
-        if pending_connection.link in self._pending_connections:
+        if pending_connection.client_socket in self._pending_connections:
             return
         if len(self._pending_connections) >= MAX_PENDING_CONNECTIONS:
             self._drop_oldest_pending()
-        self._pending_connections[pending_connection.link] = pending_connection
+        self._pending_connections[pending_connection.client_socket] = pending_connection
         asyncio.get_running_loop().add_reader(
-            pending_connection.link, self._receive, pending_connection
+            pending_connection.client_socket, self._receive, pending_connection
         )
 
     def _drop_oldest_pending(self) -> bool:
@@ -212,13 +212,13 @@ class Server:
             pending for pending in self._pending_connections.values() if pending.peer.pid == pid
         )
         self._forget_pending(oldest_pending)
-        _refuse_connection(oldest_pending.link)
+        _refuse_connection(oldest_pending.client_socket)
         return True
 
     def _forget_pending(self, pending_connection: "_PendingConnection") -> None:
         """Stop waiting for the data of a connection."""
-        if self._pending_connections.pop(pending_connection.link, None) is not None:
-            asyncio.get_running_loop().remove_reader(pending_connection.link)
+        if self._pending_connections.pop(pending_connection.client_socket, None) is not None:
+            asyncio.get_running_loop().remove_reader(pending_connection.client_socket)
 
     # Clients
 
@@ -234,10 +234,10 @@ class Server:
             # This runs in a thread, because the user database may be on a network.
             threading.Thread(target=resolve_user, args=(uid,), daemon=True).start()
         client = _ClientConnection(
-            self, self._service, pending_connection.peer, bytes(pending_connection.received)
+            self, self._service, pending_connection.peer, bytes(pending_connection.received_bytes)
         )
         self._clients.add(client)
-        client.connecting = asyncio.create_task(_connect(pending_connection.link, client))
+        client.connecting = asyncio.create_task(_connect(pending_connection.client_socket, client))
 
     def _disconnect_idle_client(self) -> bool:
         """Disconnect an idle client to make room for another; return False if none is idle.
@@ -258,7 +258,7 @@ class Server:
 
     def _refuse_unless_stop(self, pending_connection: "_PendingConnection") -> None:
         """Refuse a connection for which there is no room, unless it requests a `stop`."""
-        request_line = bytes(pending_connection.received).partition(b"\n")[0]
+        request_line = bytes(pending_connection.received_bytes).partition(b"\n")[0]
         with suppress(RequestError):
             request = parse_request(request_line)
             if isinstance(request, StopSessionRequest):
@@ -266,7 +266,7 @@ class Server:
                 self._stop_tasks.add(stop_task)
                 stop_task.add_done_callback(self._stop_tasks.discard)
                 return
-        _refuse_connection(pending_connection.link)
+        _refuse_connection(pending_connection.client_socket)
 
     async def _stop_and_close(
         self, request: StopSessionRequest, pending_connection: "_PendingConnection"
@@ -274,7 +274,7 @@ class Server:
         """Execute the request `stop` of a connection, send the reply, and close the connection."""
         assert self._service is not None
         _send_last_line(
-            pending_connection.link,
+            pending_connection.client_socket,
             _json_line(await _reply(self._service, request, pending_connection.peer)),
         )
 
@@ -289,7 +289,7 @@ class Server:
             new_socket, _ = self._listener.accept()
             pending_connection = self._identified_connection(new_socket)
             with suppress(BlockingIOError):
-                pending_connection.received += new_socket.recv(MAX_LINE_BYTES)
+                pending_connection.received_bytes += new_socket.recv(MAX_LINE_BYTES)
             self._refuse_unless_stop(pending_connection)
         self._reserve_spare_fd()
 
@@ -309,19 +309,19 @@ class Server:
 class _PendingConnection:
     """Connection that has not sent a complete line yet."""
 
-    link: socket.socket
+    client_socket: socket.socket
     peer: Peer
-    received: bytearray = field(default_factory=bytearray)
+    received_bytes: bytearray = field(default_factory=bytearray)
 
 
 class _ClientConnection(asyncio.Protocol):
     """Connection of a client: reads its requests, and sends replies and events."""
 
-    def __init__(self, server: Server, service: Service, peer: Peer, received: bytes) -> None:
+    def __init__(self, server: Server, service: Service, peer: Peer, received_bytes: bytes) -> None:
         self._server = server
         self._service = service
         self._peer = peer
-        self._received = received
+        self._received_bytes = received_bytes
         """Bytes that were received before the connection became a client."""
         self._transport: asyncio.Transport | None = None
         self._pending = bytearray()
@@ -339,7 +339,7 @@ class _ClientConnection(asyncio.Protocol):
     def is_idle(self) -> bool:
         """Whether the client has no subscription, does not control the rig and awaits no reply."""
         return not (
-            self._received
+            self._received_bytes
             or self.is_subscribed
             or self._tasks
             or self._waiting_lines
@@ -365,7 +365,7 @@ class _ClientConnection(asyncio.Protocol):
         if self._is_leaving:  # the client was dismissed before its connection was made
             self.disconnect()
             return
-        received_bytes, self._received = self._received, b""
+        received_bytes, self._received_bytes = self._received_bytes, b""
         self.data_received(received_bytes)
 
     def data_received(self, data: bytes) -> None:
@@ -398,14 +398,14 @@ class _ClientConnection(asyncio.Protocol):
             self._next_line_timer.cancel()
         self._waiting_lines.clear()
         self._transport = None
-        self._service.release(self._peer)
-        self._server.remove(self)
+        self._service.release_control(self._peer)
+        self._server.remove_client(self)
 
-    def write(self, data: bytes) -> None:
+    def write(self, output_bytes: bytes) -> None:
         """Send bytes to the client; disconnect it if too much output is unread."""
         if self._transport is None or self._transport.is_closing():
             return
-        self._transport.write(data)
+        self._transport.write(output_bytes)
         if self._transport.get_write_buffer_size() > _MAX_UNREAD_BYTES:
             self.disconnect()
 
@@ -515,7 +515,11 @@ def _json_line(document: Document) -> bytes:
 
 
 def _refusal_document(
-    request_id: Id | None, refusal_text: str, *, command: str | None = None, wrong_use: bool = True
+    request_id: RequestId | None,
+    refusal_text: str,
+    *,
+    command: str | None = None,
+    wrong_use: bool = True,
 ) -> Document:
     """Return the reply that refuses a request, with the reason."""
     refusal_reply = {"reply": command, "ok": False, "error": refusal_text, "wrong_use": wrong_use}

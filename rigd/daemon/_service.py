@@ -45,7 +45,7 @@ from rigd.runner.request import remaining_file_text
 from rigd.runner.session import SessionFailedError
 from rigd.runner.status import RigStatus
 
-POLL_S = 0.2
+POLL_INTERVAL_S = 0.2
 """Time in seconds between two checks of the rig."""
 _SIGNALS_INTERVAL_S = 0.05
 """Time in seconds between two blocks of signals that are sent to clients during a session."""
@@ -53,12 +53,12 @@ _MAX_PREDICTIONS = 4
 """Maximum number of predictions that are running or waiting; only one is running at a time."""
 _UNRESPONSIVE_AFTER_S = 1.5
 """Time in seconds without a poll after which the event loop is assumed to receive no stop."""
-_RATE_POLLS = 10
+_RATE_WINDOW_POLLS = 10
 """Number of polls over which message rates are measured."""
 _SHUTTING_DOWN_MESSAGE = "The daemon is being shut down."
 """Reason with which requests are refused while the daemon ends."""
 
-T = TypeVar("T")
+ReturnType = TypeVar("ReturnType")
 
 _log = logging.getLogger(LOGGER_NAME)
 
@@ -76,7 +76,7 @@ class Service:
         self,
         rig: Rig,
         profile: Profile,
-        folder: Path,
+        session_folder: Path,
         rig_executor: Executor,
         publish: PublishEvent,
         find_actuation_target: Callable[[], ActuationTarget],
@@ -87,16 +87,16 @@ class Service:
     ) -> None:
         self._rig = rig
         self._profile = profile
-        self._folder = folder
-        self._worker = rig_executor
+        self._session_folder = session_folder
+        self._rig_executor = rig_executor
         self._publish = publish
-        self._find_target = find_actuation_target
+        self._find_actuation_target = find_actuation_target
         self._announced_target = find_actuation_target()
         self._failed_checks = [
             asdict(failed_check) for failed_check in run_offline_checks(profile).failed
         ]
         self._uses_virtual_clock = uses_virtual_clock
-        self._live = with_live_view
+        self._with_live_view = with_live_view
         self._state_machine = DaemonStateMachine(self._report_transition)
         self._began_utc_ns = time.time_ns()
         self._fault_reason = ""
@@ -115,7 +115,7 @@ class Service:
         self._last_poll_s = inf
         self._rig_status: RigStatus | None = None
         self._timed_message_counts: deque[tuple[float, dict[str, int]]] = deque(
-            maxlen=_RATE_POLLS + 1
+            maxlen=_RATE_WINDOW_POLLS + 1
         )
         self._signal_watchers: set[Peer] = set()
         self._prediction_count = 0
@@ -144,7 +144,7 @@ class Service:
     async def run(self) -> None:
         """Poll the rig and publish its progress several times a second, until cancelled."""
         while True:
-            await asyncio.sleep(POLL_S)
+            await asyncio.sleep(POLL_INTERVAL_S)
             self._last_poll_s = time.monotonic()
             self.poll_status()
             if self._quick_looks is not None:
@@ -156,7 +156,7 @@ class Service:
         """Publish signals to subscribed clients until cancelled."""
         while True:
             is_session_running = self.state in (DaemonState.RUNNING, DaemonState.STOPPING)
-            await asyncio.sleep(_SIGNALS_INTERVAL_S if is_session_running else POLL_S)
+            await asyncio.sleep(_SIGNALS_INTERVAL_S if is_session_running else POLL_INTERVAL_S)
             self._publish_signals()
 
     def _publish_signals(self) -> None:
@@ -165,7 +165,9 @@ class Service:
             return
         served_series = self._series
         planned_series = (
-            served_series.planned if served_series is not None and served_series.running else None
+            served_series.planned_series
+            if served_series is not None and served_series.is_running
+            else None
         )
         for signal_block in self._rig.signals():
             self._publish(
@@ -190,11 +192,11 @@ class Service:
         if self.state is DaemonState.READY:
             self._state_machine.change_to(DaemonState.IDLE, reason)
 
-    def set_page_address(self, address: str | None) -> None:
+    def set_page_address(self, page_address: str | None) -> None:
         """Store the address of the operator's page for the status; any thread may call this."""
-        self._page_address = address
+        self._page_address = page_address
 
-    def release(self, peer: Peer) -> None:
+    def release_control(self, peer: Peer) -> None:
         """End the subscriptions and the control of a disconnected client; its sessions continue."""
         self._signal_watchers.discard(peer)
         if self.controller == peer:
@@ -224,7 +226,7 @@ class Service:
 
     async def _execute_command(self, request: protocol.AnyRequest, peer: Peer) -> Document:
         """Execute a request that may change the rig, and return the reply."""
-        if request.controlling:
+        if request.is_controlling:
             self._take_control(peer)
             await self._await_first_connection(peer)
         if isinstance(request, protocol.StartRequest):
@@ -246,15 +248,17 @@ class Service:
         return {
             "daemon": daemon_document(
                 self._profile.name,
-                str(self._folder),
-                moving=self._announced_target.value,
-                hardware=self._announced_target is ActuationTarget.HARDWARE,
-                moving_text=describe_actuation_target(self._profile.rig, self._announced_target),
-                fast=self._uses_virtual_clock,
-                live=self._live,
-                web=self._page_address,
+                str(self._session_folder),
+                moving_target=self._announced_target.value,
+                moves_hardware=self._announced_target is ActuationTarget.HARDWARE,
+                target_description=describe_actuation_target(
+                    self._profile.rig, self._announced_target
+                ),
+                uses_virtual_clock=self._uses_virtual_clock,
+                with_live_view=self._with_live_view,
+                page_address=self._page_address,
                 calibration=self._rig.calibration,
-                quick_looks=self._quick_looks is not None,
+                makes_quick_looks=self._quick_looks is not None,
                 failed_checks=self._failed_checks,
                 began_utc_ns=self._began_utc_ns,
             ),
@@ -275,10 +279,10 @@ class Service:
         """Request the end of the running series; the reply states whether a series was running."""
         self._stop_count += 1
         series = self._series
-        if series is None or not series.running:
+        if series is None or not series.is_running:
             return {"stopping": False}
-        if not series.stop.requested:
-            series.stop.request()
+        if not series.stop_request.requested:
+            series.stop_request.request()
             if self.state is DaemonState.RUNNING:
                 self._state_machine.change_to(DaemonState.STOPPING, reason)
         return {"stopping": True}
@@ -341,9 +345,9 @@ class Service:
         """Raise CommandError if the state forbids a command, or if the rig is busy."""
         if self._is_closing:
             raise CommandError(_SHUTTING_DOWN_MESSAGE)
-        refusal = self._state_machine.refusal(command)
-        if refusal:
-            raise CommandError(refusal)
+        refusal_text = self._state_machine.refusal_text(command)
+        if refusal_text:
+            raise CommandError(refusal_text)
         self._require_not_busy()
 
     def _require_not_busy(self) -> None:
@@ -355,20 +359,20 @@ class Service:
         """Predict a session in a background process, so that other requests are not delayed."""
         if self._prediction_count >= _MAX_PREDICTIONS:
             raise CommandError("Several predictions are running; try again in a moment.")
-        job = background.PredictionJob(
+        prediction_job = background.PredictionJob(
             self._profile,
             request.excitation,
             request.parameters,
             request.force,
             request.notes.specimen,
-            self._start_rad(),
+            self._start_angle_rad(),
             tuple(request.accept),
             request.tip_slope_rad,
         )
         self._prediction_count += 1
         try:
             async with self._prediction_lock:
-                return await background.perform(job)
+                return await background.perform(prediction_job)
         finally:
             self._prediction_count -= 1
 
@@ -400,39 +404,43 @@ class Service:
             )
         self._series_count += 1
         previous_series = self._series
-        served_series = self._series = ServedSeries(self._series_count, request, running=True)
+        served_series = self._series = ServedSeries(self._series_count, request, is_running=True)
         self._current_command = "planning"
         try:
-            job = background.PlanJob(self._profile, request, self._folder, self._start_rad())
-            planned_series = await (
-                background.perform(job) if job.is_heavy else self._call_in_worker(job.perform)
+            plan_job = background.PlanJob(
+                self._profile, request, self._session_folder, self._start_angle_rad()
             )
-            if served_series.stop.requested or self._is_closing:
+            planned_series = await (
+                background.perform(plan_job)
+                if plan_job.is_heavy
+                else self._call_in_worker(plan_job.perform)
+            )
+            if served_series.stop_request.requested or self._is_closing:
                 raise CommandError("It was stopped before it began.")
-            refusal = self._state_machine.refusal("start")
-            if refusal:
-                raise CommandError(refusal)
+            refusal_text = self._state_machine.refusal_text("start")
+            if refusal_text:
+                raise CommandError(refusal_text)
         except Exception:
             self._series = previous_series
             raise
         finally:
             self._current_command = ""
         for plan_warning in planned_series.plan.warnings:
-            _log.warning("series %d: %s", served_series.number, plan_warning)
-        served_series.planned = planned_series
+            _log.warning("series %d: %s", served_series.series_number, plan_warning)
+        served_series.planned_series = planned_series
         repeat_text = f", {request.repeat} sessions" if request.repeat > 1 else ""
         self._state_machine.change_to(
             DaemonState.RUNNING, f"{served_series.description} was started{repeat_text}"
         )
         self._task = asyncio.create_task(self._run_series_to_end(served_series, planned_series))
-        return {"series": served_series.number, "plan": planned_series.plan_document()}
+        return {"series": served_series.series_number, "plan": planned_series.plan_document()}
 
-    async def _measure(self, command_name: str, measure: Callable[[], Document]) -> Document:
+    async def _measure(self, command_name: str, measure_rig: Callable[[], Document]) -> Document:
         """Tare the sensor or set the motor's zero in the worker thread, and return the result."""
         self._require_command_allowed(command_name)
         self._current_command = command_name
         try:
-            return await self._call_in_worker(measure)
+            return await self._call_in_worker(measure_rig)
         except RigError as error:
             if not self._rig.connected and self.state is DaemonState.READY:
                 self._state_machine.change_to(DaemonState.FAULT, str(error))
@@ -468,7 +476,7 @@ class Service:
         `earlier_fault` is the reason of the fault that is being reset, or empty.
         """
         try:
-            actuation_target = self._find_target()
+            actuation_target = self._find_actuation_target()
             if actuation_target is not self._announced_target:
                 raise RigError(
                     f"{actuation_target.value.capitalize()} would move now, but the daemon was "
@@ -505,7 +513,7 @@ class Service:
 
     # Series
 
-    def _start_rad(self) -> float:
+    def _start_angle_rad(self) -> float:
         """Return the motor angle relative to the rig's zero in rad, or 0 if unknown."""
         rig_status = self._rig.status()
         return 0.0 if rig_status is None else rig_status.angle_rad
@@ -519,30 +527,34 @@ class Service:
                 partial(self._run_series, series, planned_series, event_loop)
             )
         except (UserError, RigError, ProbeFailedError, SessionFailedError) as error:
-            series.reason = str(error)
+            series.end_reason = str(error)
             if not error.wrong_use:
                 session_path = error.path if isinstance(error, SessionFailedError) else None
-                fault_reason = series.reason = f"{error} {remaining_file_text(session_path)}"
+                fault_reason = series.end_reason = f"{error} {remaining_file_text(session_path)}"
         except Exception as error:
             # After an unexpected error the rig is disconnected, because nothing else may switch it
             # off.
             _log.exception("unexpected error in a session")
-            fault_reason = series.reason = f"The session failed: unexpected error ({error!r})."
+            fault_reason = series.end_reason = f"The session failed: unexpected error ({error!r})."
             await self._disconnect_safely()
         else:
-            last_result = series.results[-1] if series.results else None
+            last_result = series.session_results[-1] if series.session_results else None
             if last_result is not None and not last_result.is_successful:
-                series.reason = last_result.reason
+                series.end_reason = last_result.reason
                 if last_result.fault:
                     fault_reason = last_result.reason
         if not self._rig.connected:
-            fault_reason = fault_reason or series.reason or "The connection to the devices is lost."
+            fault_reason = (
+                fault_reason or series.end_reason or "The connection to the devices is lost."
+            )
         try:
             self._publish_signals()  # the last signals are sent before the report of the end
         except Exception:
             _log.exception("the last signals could not be sent")
-        series.running = False
-        series.failed = bool(fault_reason or (series.reason and not series.stop.requested))
+        series.is_running = False
+        series.has_failed = bool(
+            fault_reason or (series.end_reason and not series.stop_request.requested)
+        )
         self._state_machine.change_to(*series.state_after(fault_reason))
         self._publish({"event": "series", **series.as_document()})
 
@@ -565,9 +577,9 @@ class Service:
         try:
             planned_series.run(
                 self._rig,
-                series.stop,
+                series.stop_request,
                 series_reporter,
-                with_live_view=self._live,
+                with_live_view=self._with_live_view,
                 can_receive_stop=self._can_receive_stop,
                 quick_looks=self._quick_looks,
             )
@@ -587,11 +599,16 @@ class Service:
     def _progress_document(self) -> Document | None:
         """Return the progress of the running session for JSON, or None if none is running."""
         series, rig_status = self._series, self._rig_status
-        if series is None or not series.running or series.planned is None or rig_status is None:
+        if (
+            series is None
+            or not series.is_running
+            or series.planned_series is None
+            or rig_status is None
+        ):
             return None
         rate_hz = None if self._uses_virtual_clock else self._profile.rig.rate_hz
-        progress_event = progress_document(rig_status, series.planned.ticks, rate_hz)
-        return {"session": series.session, "repeat": series.request.repeat, **progress_event}
+        progress_event = progress_document(rig_status, series.planned_series.ticks, rate_hz)
+        return {"session": series.session_number, "repeat": series.request.repeat, **progress_event}
 
     def _message_rates(self) -> dict[str, float | None]:
         """Return the measured message rate of each topic, in messages per second."""
@@ -624,7 +641,7 @@ class Service:
     def _report_quick_look(self, quick_look: QuickLook) -> None:
         """Log and publish a quick look at a session; any thread may call this."""
         if self._series is not None:
-            quick_look.add_path_to_results(self._series.results)
+            quick_look.add_path_to_results(self._series.session_results)
         for report_line in quick_look.lines:
             _log.info("%s", report_line)
         if self._loop is not None:
@@ -632,6 +649,6 @@ class Service:
                 self._publish, {"event": "quick_look", **quick_look.as_dict()}
             )
 
-    async def _call_in_worker(self, function: Callable[[], T]) -> T:
+    async def _call_in_worker(self, rig_function: Callable[[], ReturnType]) -> ReturnType:
         """Call a function in the worker thread, and return its result."""
-        return await asyncio.get_running_loop().run_in_executor(self._worker, function)
+        return await asyncio.get_running_loop().run_in_executor(self._rig_executor, rig_function)

@@ -18,7 +18,7 @@ from rigd.live.address import LiveAddress
 from rigd.runner.signal_blocks import SignalBlock
 from rigd.runner.status import ProcessStatus, RigStatus
 
-_MAX_HISTORY = 50
+_MAX_STORED_TRANSITIONS = 50
 """Largest number of transitions that the daemon's status lists."""
 
 
@@ -97,7 +97,7 @@ class DaemonStateMachine:
         self._utc_ns = utc_ns
         self._began_utc_ns = utc_ns()
         self.state = DaemonState.IDLE
-        self.history: deque[Transition] = deque(maxlen=_MAX_HISTORY)
+        self.history: deque[Transition] = deque(maxlen=_MAX_STORED_TRANSITIONS)
 
     @property
     def since_utc_ns(self) -> int:
@@ -121,7 +121,7 @@ class DaemonStateMachine:
         self.history.append(transition)
         self._on_change(transition)
 
-    def refusal(self, command: str) -> str:
+    def refusal_text(self, command: str) -> str:
         """Return a sentence that refuses a command in the present state; "" if it is permitted."""
         required_state = _REQUIRED_STATES.get(command, self.state)
         if required_state is self.state:
@@ -223,7 +223,9 @@ def rig_document(status: RigStatus, rates_hz: Mapping[str, float | None]) -> Doc
     }
 
 
-def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | None) -> Document:
+def signals_document(
+    signal_block: SignalBlock, rate_hz: float, frequency_hz: float | None
+) -> Document:
     """Return the event with a block of signals as a dictionary for JSON.
 
     `rate_hz` is the sample rate, and `frequency_hz` the frequency of the excitation at the block's
@@ -231,16 +233,16 @@ def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | N
     """
     return {
         "event": "signals",
-        "first_tick": block.first_tick,
-        "count": block.count,
+        "first_tick": signal_block.first_tick,
+        "count": signal_block.count,
         "rate_hz": rate_hz,
-        "t_ns": block.t_ns,
+        "t_ns": signal_block.t_ns,
         **{
             signal_name: base64.b64encode(signal_values.astype("<f4").tobytes()).decode("ascii")
-            for signal_name, signal_values in block.signals.items()
+            for signal_name, signal_values in signal_block.signals.items()
         },
         "gauges": None
-        if block.gauges is None
+        if signal_block.gauges is None
         else {
             signal_name: {
                 "value": gauge.value,
@@ -248,7 +250,7 @@ def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | N
                 "unit": gauge.unit,
                 "fraction": gauge.fraction,
             }
-            for signal_name, gauge in block.gauges.items()
+            for signal_name, gauge in signal_block.gauges.items()
         },
         "frequency_hz": frequency_hz,
     }
@@ -262,9 +264,9 @@ def _finite_or_none(numbers_by_name: Mapping[str, float]) -> Document:
     }
 
 
-def _view_document(view: LiveAddress | None) -> Document | None:
+def _view_document(live_view: LiveAddress | None) -> Document | None:
     """Return the address of the live view as a dictionary for JSON, or None without live view."""
-    return None if view is None else {"url": view.page_url, **asdict(view)}
+    return None if live_view is None else {"url": live_view.page_url, **asdict(live_view)}
 
 
 def _process_state(process: ProcessStatus, phase: Phase) -> str:
@@ -272,10 +274,10 @@ def _process_state(process: ProcessStatus, phase: Phase) -> str:
 
     A process that runs for one session only is ``done``, not ``ended``, after the session.
     """
-    is_for_one_session = any(p.is_per_session and p.name == process.name for p in PROCESSES)
+    is_process_per_session = any(p.is_per_session and p.name == process.name for p in PROCESSES)
     return (
         "done"
-        if process.state == "ended" and is_for_one_session and phase is Phase.OFF
+        if process.state == "ended" and is_process_per_session and phase is Phase.OFF
         else process.state
     )
 
@@ -286,7 +288,7 @@ _PUBLISHED_FIT_KEYS = (
 )
 """Keys of a fit that clients receive; other values, such as the covariance, are too long."""
 _MAX_LIST_ITEMS, _MAX_TEXT_CHARACTERS = 16, 400
-_OMITTED_KEYS = frozenset({"pieces", "constants"})
+_OMITTED_FIT_KEYS = frozenset({"pieces", "constants"})
 """Keys that are left out of a fit because their values are too long: the segments of a search, and
 the modal constants of the test of a uniform beam."""
 
@@ -309,7 +311,7 @@ def _shortened_value(json_value: Any) -> Any:  # noqa: ANN401 - what JSON has
         return {
             key: _shortened_value(member_name)
             for key, member_name in json_value.items()
-            if key not in _OMITTED_KEYS
+            if key not in _OMITTED_FIT_KEYS
         }
     if isinstance(json_value, list | tuple):
         return [_shortened_value(list_item) for list_item in json_value[:_MAX_LIST_ITEMS]]
@@ -338,17 +340,17 @@ def progress_document(status: RigStatus, record_ticks: int, rate_hz: float | Non
 
 
 def daemon_document(
-    profile: str,
-    output: str,
+    profile_name: str,
+    session_folder: str,
     *,
-    moving: str,
-    hardware: bool,
-    moving_text: str,
-    fast: bool,
-    live: bool,
-    web: str | None,
+    moving_target: str,
+    moves_hardware: bool,
+    target_description: str,
+    uses_virtual_clock: bool,
+    with_live_view: bool,
+    page_address: str | None,
     calibration: Mapping[str, Any] | None,
-    quick_looks: bool,
+    makes_quick_looks: bool,
     failed_checks: list[Document],
     began_utc_ns: int,
 ) -> Document:
@@ -358,21 +360,21 @@ def daemon_document(
     return {
         "pid": os.getpid(),
         "version": __version__,
-        "profile": profile,
-        "moving": moving,
-        "hardware": hardware,
-        "what_moves": moving_text,
-        "output": output,
-        "fast": fast,
-        "live": live,
-        "web": web,
+        "profile": profile_name,
+        "moving": moving_target,
+        "hardware": moves_hardware,
+        "what_moves": target_description,
+        "output": session_folder,
+        "fast": uses_virtual_clock,
+        "live": with_live_view,
+        "web": page_address,
         "calibration": None
         if calibration is None
         else {
             "serial": str(calibration.get("serial_number", "")),
             "age": str(calibration.get("calibration_date", "")),
         },
-        "quick_looks": quick_looks,
+        "quick_looks": makes_quick_looks,
         "failed_checks": failed_checks,
         "since_utc_ns": began_utc_ns,
     }

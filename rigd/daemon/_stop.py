@@ -20,8 +20,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.daemon.address import GROUP_FOLDER, SOCKET_SUFFIX, own_sockets, peer_at
-from rigd.daemon.client import UNKNOWN_STATE, await_end, stop_session
+from rigd.daemon.address import GROUP_FOLDER, SOCKET_SUFFIX, daemon_pid_and_uid, own_daemon_sockets
+from rigd.daemon.client import UNKNOWN_STATE_ADVICE, await_series_end, stop_session
 from rigd.engine import CONNECTING_NAME, IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.errors import RigdError
 from rigd.runtime import STOP_SIGNAL
@@ -39,7 +39,7 @@ _REPEAT_SIGNAL_INTERVAL_S: Final = 0.5
 """Time in seconds after which the stop signal is sent again."""
 _SIGNAL_REACTION_TIME_S: Final = 0.05
 """Time in seconds after the stop signal from which a process is assumed to have reacted."""
-_POLL_S: Final = 0.02
+_POLL_INTERVAL_S: Final = 0.02
 """Time in seconds between two readings of the process table."""
 _DAEMON_POLL_INTERVAL_S: Final = 0.25
 """Time in seconds between two readings of the process table while only daemons are awaited."""
@@ -53,65 +53,73 @@ class StopReport:
 
     Attributes
     ----------
-    stopped
+    stopped_sessions
         Sessions that have ended, with excitation or command, rig and process.
-    stopping
+    stopping_sessions
         Sessions that were requested to stop, if their end is not waited for.
-    quiet
+    sentences_without_session
         Sentences on rigs that run no session.
-    running
+    unended_sessions
         Sessions that were requested to stop, but have not ended in time.
-    unconfirmed
+    unconfirmed_drives
         Sentences on rigs that run no session, but whose drive has not shown that it is off.
     doubts
         Sentences on folders and tables that could not be read, and on replies that are not trusted.
-    others
+    sessions_of_others
         Sessions of other users, which this user cannot stop.
-    searched
+    searched_locations
         Tables and folders that were searched for sessions.
     """
 
-    stopped: list[str] = field(default_factory=list)
-    stopping: list[str] = field(default_factory=list)
-    quiet: list[str] = field(default_factory=list)
-    running: list[str] = field(default_factory=list)
-    unconfirmed: list[str] = field(default_factory=list)
+    stopped_sessions: list[str] = field(default_factory=list)
+    stopping_sessions: list[str] = field(default_factory=list)
+    sentences_without_session: list[str] = field(default_factory=list)
+    unended_sessions: list[str] = field(default_factory=list)
+    unconfirmed_drives: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
-    others: list[str] = field(default_factory=list)
-    searched: list[str] = field(default_factory=list)
+    sessions_of_others: list[str] = field(default_factory=list)
+    searched_locations: list[str] = field(default_factory=list)
 
     @property
-    def found(self) -> bool:
+    def has_found_process(self) -> bool:
         """Whether a process was found that can run sessions."""
-        return bool(self.stopped or self.stopping or self.quiet or self.running or self.unconfirmed)
+        return bool(
+            self.stopped_sessions
+            or self.stopping_sessions
+            or self.sentences_without_session
+            or self.unended_sessions
+            or self.unconfirmed_drives
+        )
 
     @property
-    def sure(self) -> bool:
+    def is_stop_certain(self) -> bool:
         """Whether it is certain that no session of this user runs, and that its drive is off."""
-        return not (self.running or self.unconfirmed or self.doubts)
+        return not (self.unended_sessions or self.unconfirmed_drives or self.doubts)
 
 
-def stop_all(rig: str | None, *, wait: bool = True) -> StopReport:
+def stop_all(rig_name: str | None, *, is_end_awaited: bool = True) -> StopReport:
     """Stop all sessions of this user, or of all users for root, and report what was found.
 
     Parameters
     ----------
-    rig
+    rig_name
         Name of the only rig whose sessions are stopped, or None for all rigs.
-    wait
+    is_end_awaited
         Whether to wait until the sessions have ended, for at most 10 s.
     """
-    return _StopOfAll(None if rig is None else file_name(rig), is_end_awaited=wait).run()
+    return _StopOfAll(
+        None if rig_name is None else file_name(rig_name), is_end_awaited=is_end_awaited
+    ).run()
 
 
 class _StopOfAll:
     """Stop of all sessions of a user, on all rigs or on one.
 
-    `rig` is the name of the rig as in file names, or None for all rigs.
+    `rig_name` is the name of the rig as in file names, or None for all rigs.
     """
 
-    def __init__(self, rig: str | None, *, is_end_awaited: bool) -> None:
-        self._rig = rig
+    def __init__(self, rig_file_name: str | None, *, is_end_awaited: bool) -> None:
+        self._rig_name = rig_file_name
         self._is_end_awaited = is_end_awaited
         self._uid = os.getuid()
         self._report = StopReport()
@@ -126,23 +134,28 @@ class _StopOfAll:
         for daemon in daemons:
             daemon.begin()
         unended_supervisors = self._stop_supervisors(daemons)
-        disabled_pids = {
+        disabled_drive_pids = {
             supervisor_stop.process.pid
             for supervisor_stop in self._own_supervisors.values()
-            if supervisor_stop not in unended_supervisors and supervisor_stop.has_shown_off
+            if supervisor_stop not in unended_supervisors and supervisor_stop.has_shown_torque_off
         }
-        trusted_pids = set()
+        trusted_daemon_pids = set()
         for daemon in daemons:
-            daemon.report_to(self._report, disabled=daemon.pid in disabled_pids)
+            daemon.report_to(self._report, is_drive_disabled=daemon.pid in disabled_drive_pids)
             if not daemon.doubt:
-                trusted_pids.add(daemon.pid)
+                trusted_daemon_pids.add(daemon.pid)
         for supervisor in self._own_supervisors.values():
-            if supervisor.process.pid not in trusted_pids:
+            if supervisor.process.pid not in trusted_daemon_pids:
                 has_ended = supervisor not in unended_supervisors
-                supervisor.report_to(self._report, ended=has_ended, waited=self._is_end_awaited)
+                supervisor.report_to(
+                    self._report, has_ended=has_ended, is_end_awaited=self._is_end_awaited
+                )
         for other_supervisor in self._supervisors_of_others:
-            if other_supervisor.has_session and other_supervisor.process.pid not in trusted_pids:
-                self._report.others.append(
+            if (
+                other_supervisor.has_session
+                and other_supervisor.process.pid not in trusted_daemon_pids
+            ):
+                self._report.sessions_of_others.append(
                     f"{other_supervisor.description} of user "
                     f"{_user_name(other_supervisor.process.uid)}"
                 )
@@ -158,15 +171,15 @@ class _StopOfAll:
     def _find_daemons(self) -> "list[_DaemonStop]":
         """Return the daemons that listen on a socket, sorted by the path of the socket."""
         report = self._report
-        report.searched.append("the listening sockets (/proc/net/unix)")
-        report.searched.append(f"{tempfile.gettempdir()}/rigd-{self._uid or ''}*")
+        report.searched_locations.append("the listening sockets (/proc/net/unix)")
+        report.searched_locations.append(f"{tempfile.gettempdir()}/rigd-{self._uid or ''}*")
         try:
-            socket_paths = set(own_sockets())
+            socket_paths = set(own_daemon_sockets())
         except OSError as error:
             report.doubts.append(f"The list of sockets cannot be read ({error.strerror}).")
             socket_paths = set()
         for folder in [*known_folders(self._uid or None), GROUP_FOLDER]:
-            report.searched.append(str(folder))
+            report.searched_locations.append(str(folder))
             folder_fault_text = folder_fault(folder, is_shared=folder == GROUP_FOLDER)
             if folder_fault_text:
                 report.doubts.append(folder_fault_text)
@@ -188,14 +201,14 @@ class _StopOfAll:
             socket_paths.update(folder_sockets)
         daemons = []
         for daemon_socket in sorted(socket_paths):
-            rig = daemon_socket.name.removesuffix(SOCKET_SUFFIX)
-            if self._rig in (None, rig):
+            rig_name = daemon_socket.name.removesuffix(SOCKET_SUFFIX)
+            if self._rig_name in (None, rig_name):
                 with suppress(ConnectionRefusedError, FileNotFoundError):  # of a dead daemon
                     try:
                         daemons.append(
                             _DaemonStop(
                                 daemon_socket,
-                                peer_at(daemon_socket),
+                                daemon_pid_and_uid(daemon_socket),
                                 is_end_awaited=self._is_end_awaited,
                             )
                         )
@@ -212,7 +225,7 @@ class _StopOfAll:
 
         Returns the supervisors whose session has not ended in time.
         """
-        self._report.searched.insert(0, "the process table (/proc)")
+        self._report.searched_locations.insert(0, "the process table (/proc)")
         while True:
             try:
                 process_table = read_processes()
@@ -224,14 +237,16 @@ class _StopOfAll:
                 for daemon in daemons:
                     daemon.join(2.0 * _END_TIMEOUT_S)
                 return []
-            sufficient_pids = {daemon.pid for daemon in daemons if self._is_reached(daemon)}
+            socket_stopped_pids = {
+                daemon.pid for daemon in daemons if self._is_stopped_by_socket(daemon)
+            }
             unended_supervisors = []
             for supervisor in self._update_supervisors(process_table):
-                if supervisor.process.pid in sufficient_pids:
+                if supervisor.process.pid in socket_stopped_pids:
                     continue
                 self._own_supervisors.setdefault(supervisor.identity, supervisor)
                 supervisor.send_due_signals(self._elapsed_s)
-                if not supervisor.is_over:
+                if not supervisor.is_session_over:
                     unended_supervisors.append(supervisor)
             awaited_daemons = [daemon for daemon in daemons if self._is_awaited(daemon)]
             if not (awaited_daemons or (unended_supervisors and self._is_end_awaited)):
@@ -239,11 +254,11 @@ class _StopOfAll:
             if self._elapsed_s > _END_TIMEOUT_S and not awaited_daemons:
                 return unended_supervisors
             if unended_supervisors or not awaited_daemons:
-                time.sleep(_POLL_S)
+                time.sleep(_POLL_INTERVAL_S)
             else:  # reading the process table takes processor time that the daemon may need
                 awaited_daemons[0].join(_DAEMON_POLL_INTERVAL_S)
 
-    def _is_reached(self, daemon: "_DaemonStop") -> bool:
+    def _is_stopped_by_socket(self, daemon: "_DaemonStop") -> bool:
         """Return whether a daemon is stopped through its socket, so that it needs no signal."""
         return daemon.doubt == "" and (daemon.is_done or self._elapsed_s < _STOP_CONTROL_DELAY_S)
 
@@ -257,8 +272,8 @@ class _StopOfAll:
             for supervisor in supervisors
         ):
             return False
-        patience_s = _DOUBTED_REPLY_TIMEOUT_S if daemon.doubt else 2.0 * _END_TIMEOUT_S
-        return self._elapsed_s < patience_s
+        timeout_s = _DOUBTED_REPLY_TIMEOUT_S if daemon.doubt else 2.0 * _END_TIMEOUT_S
+        return self._elapsed_s < timeout_s
 
     def _update_supervisors(
         self, process_table: Sequence[RunningProcess]
@@ -276,9 +291,9 @@ class _StopOfAll:
             supervisor = self._own_supervisors.get((process.pid, process.start_ticks or 0))
             if supervisor is None:
                 supervisor = _SupervisorStop(process, control_processes)
-                if self._rig is not None and not supervisor.may_run_rig(self._rig):
+                if self._rig_name is not None and not supervisor.may_run_rig(self._rig_name):
                     continue
-            supervisor.process, supervisor.controls = process, control_processes
+            supervisor.process, supervisor.control_processes = process, control_processes
             own_supervisors.append(supervisor)
         return own_supervisors
 
@@ -289,11 +304,13 @@ class _StopOfAll:
 class _DaemonStop:
     """Stop of a daemon through its socket, in a thread.
 
-    `path` is the path of the socket, `peer` the daemon's process id and user id.
+    `socket_path` is the path of the socket, `peer` the daemon's process id and user id.
     """
 
-    def __init__(self, path: Path, peer: tuple[int, int] | None, *, is_end_awaited: bool) -> None:
-        self._path = path
+    def __init__(
+        self, socket_path: Path, peer: tuple[int, int] | None, *, is_end_awaited: bool
+    ) -> None:
+        self._socket_path = socket_path
         self._is_end_awaited = is_end_awaited
         self._reply: dict[str, Any] = {}
         self._status: dict[str, Any] | None = None
@@ -307,9 +324,9 @@ class _DaemonStop:
         """Start the thread that stops the daemon's session."""
         self._thread.start()
 
-    def join(self, patience_s: float) -> None:
-        """Wait, for at most `patience_s` seconds, until the stop has succeeded or failed."""
-        self._thread.join(patience_s)
+    def join(self, timeout_s: float) -> None:
+        """Wait, for at most `timeout_s` seconds, until the stop has succeeded or failed."""
+        self._thread.join(timeout_s)
 
     @property
     def is_done(self) -> bool:
@@ -319,18 +336,20 @@ class _DaemonStop:
     def _stop(self) -> None:
         """Stop the daemon's session, and wait for its end if requested; run in the thread."""
         try:
-            stop_reply = stop_session(self._path)
+            stop_reply = stop_session(self._socket_path)
             self.pid, uid = stop_reply["peer"]
             self.doubt = self._reason_to_doubt(self.pid, uid)
             if self._is_end_awaited:
-                self._status = await_end(self._path, _END_TIMEOUT_S, stop_reply["peer"])
+                self._status = await_series_end(
+                    self._socket_path, _END_TIMEOUT_S, stop_reply["peer"]
+                )
             self._reply = stop_reply
         except RigdError as error:
             self._error = error
 
     def _reason_to_doubt(self, pid: int, uid: int) -> str:
         """Return the reason not to trust the replies of a process on the socket; "" if trusted."""
-        folder, rig = self._path.parent, self._path.name.removesuffix(SOCKET_SUFFIX)
+        folder, rig = self._socket_path.parent, self._socket_path.name.removesuffix(SOCKET_SUFFIX)
         is_group_folder = folder == GROUP_FOLDER
         if folder_fault(folder, is_shared=is_group_folder):
             return "Other users can write to its folder."
@@ -347,20 +366,21 @@ class _DaemonStop:
             return ""
         return f"It does not hold the lock of the rig {rig}, so it may not be a daemon."
 
-    def report_to(self, report: StopReport, *, disabled: bool) -> None:
+    def report_to(self, report: StopReport, *, is_drive_disabled: bool) -> None:
         """Add the result of the stop to a report.
 
-        `disabled` states whether the process table shows that the drive is disabled.
+        `is_drive_disabled` states whether the process table shows that the drive is disabled.
         """
-        rig = self._path.name.removesuffix(SOCKET_SUFFIX)
+        rig_name = self._socket_path.name.removesuffix(SOCKET_SUFFIX)
         if self.doubt:
-            who = f"process {self.pid}" if self.pid else "the process"
+            process_text = f"process {self.pid}" if self.pid else "the process"
             report.doubts.append(
-                f"The reply of {who} that listens on {self._path} is not trusted. {self.doubt}"
+                f"The reply of {process_text} that listens on {self._socket_path} is not "
+                f"trusted. {self.doubt}"
             )
             return
-        rig_text = f"the rig {rig} (rigd serve, process {self.pid})"
-        if disabled and not self._reply:
+        rig_text = f"the rig {rig_name} (rigd serve, process {self.pid})"
+        if is_drive_disabled and not self._reply:
             report.doubts.append(
                 f"The daemon of {rig_text} does not answer. Its control process has disabled the "
                 "drive."
@@ -368,14 +388,16 @@ class _DaemonStop:
         elif self._error is not None:
             report.doubts.append(f"Not stopped: {rig_text}. {self._error.full_message()}")
         elif not self._reply:
-            report.doubts.append(f"The daemon of {rig_text} does not answer. {UNKNOWN_STATE}")
+            report.doubts.append(
+                f"The daemon of {rig_text} does not answer. {UNKNOWN_STATE_ADVICE}"
+            )
         elif not self._is_end_awaited:
             if self._reply["stopping"]:
-                report.stopping.append(rig_text)
+                report.stopping_sessions.append(rig_text)
             else:
-                report.quiet.append(f"No session is running on {rig_text}.")
+                report.sentences_without_session.append(f"No session is running on {rig_text}.")
         elif self._status is None:
-            report.running.append(rig_text)
+            report.unended_sessions.append(rig_text)
         else:
             self._report_end(report, self._status, rig_text)
 
@@ -385,30 +407,33 @@ class _DaemonStop:
         is_stopped_by_signal = self._reply["signalled"] and series is not None and series["stopped"]
         if status["state"] == "fault" and status.get("rig") is not None:
             # The devices stay connected only if the drive has shown that it is off.
-            report.quiet.append(
+            report.sentences_without_session.append(
                 f"No session is running on {rig_text}; the torque is off. The rig is in fault: "
                 f"{status['reason']}"
             )
         elif status["state"] == "fault":
-            report.unconfirmed.append(
+            report.unconfirmed_drives.append(
                 f"No session is running on {rig_text}, but the rig is in fault, and its devices "
                 "are not connected, so the drive does not show that it is off. Reason of the "
                 f"fault: {status['reason']}"
             )
         elif status["state"] == "idle":
-            report.unconfirmed.append(
+            report.unconfirmed_drives.append(
                 f"No session is running on {rig_text}, but the devices are not connected, so the "
                 "drive does not show that it is off."
             )
         elif self._reply["stopping"] or is_stopped_by_signal:
             sessions = [] if series is None else series["sessions"]
-            path = sessions[-1]["path"] if sessions else None
+            session_path = sessions[-1]["path"] if sessions else None
             session_text = "a session" if series is None else series["excitation"]
-            report.stopped.append(
-                f"{session_text} on {rig_text}" + (f"; its file is {path}" if path else "")
+            report.stopped_sessions.append(
+                f"{session_text} on {rig_text}"
+                + (f"; its file is {session_path}" if session_path else "")
             )
         else:
-            report.quiet.append(f"No session is running on {rig_text}; the torque is off.")
+            report.sentences_without_session.append(
+                f"No session is running on {rig_text}; the torque is off."
+            )
 
 
 # Processes
@@ -426,10 +451,10 @@ class _SupervisorStop:
         """Process id of each control process that was seen → its last name."""
         self._was_session_seen = False
         """Whether a session was observed, so that its file may still be open."""
-        self.controls = control_processes
+        self.control_processes = control_processes
         self._rigd_command = _rigd_arguments(process.command)
         self._start_time = process.start_ticks or 0
-        self._rig = locked_rig(process.pid) or self._rig_of_command_line
+        self._rig_name = locked_rig(process.pid) or self._rig_of_command_line
         self._had_session = self.has_session
         self.suspended = False
         """Whether the process was sent the signal but is suspended, and cannot receive it."""
@@ -449,9 +474,11 @@ class _SupervisorStop:
             lambda argument: not argument.startswith("-"), self._rigd_command[:2]
         )
         command_name = " ".join(["rigd", *command_words]) if self._rigd_command else "a session"
-        rig_name = self._rig or _option_value(self._rigd_command, "--profile")
-        rig = "an unknown rig" if rig_name is None else f"the rig {rig_name}"
-        printable_text = "".join(c if c.isprintable() else "?" for c in f"{command_name} on {rig}")
+        rig_name = self._rig_name or _option_value(self._rigd_command, "--profile")
+        rig_text = "an unknown rig" if rig_name is None else f"the rig {rig_name}"
+        printable_text = "".join(
+            c if c.isprintable() else "?" for c in f"{command_name} on {rig_text}"
+        )
         return f"{printable_text} (process {self.process.pid})"
 
     @property
@@ -470,24 +497,24 @@ class _SupervisorStop:
     @property
     def has_session(self) -> bool:
         """Whether a session may be running, or the torque may be on."""
-        if any(control_process.name != IDLE_NAME for control_process in self.controls):
+        if any(control_process.name != IDLE_NAME for control_process in self.control_processes):
             return True
         return self._is_foreground_command and not self.process.ignores(STOP_SIGNAL)
 
     @property
-    def controls(self) -> list[RunningProcess]:
+    def control_processes(self) -> list[RunningProcess]:
         """Control processes that were running when the process table was last read."""
-        return self._controls
+        return self._control_processes
 
-    @controls.setter
-    def controls(self, control_processes: list[RunningProcess]) -> None:
-        self._controls = control_processes
+    @control_processes.setter
+    def control_processes(self, control_processes: list[RunningProcess]) -> None:
+        self._control_processes = control_processes
         for control_process in control_processes:
             self._control_name_by_pid[control_process.pid] = control_process.name
             self._was_session_seen |= control_process.name == SESSION_NAME
 
     @property
-    def _may_be_on(self) -> bool:
+    def _may_have_torque(self) -> bool:
         """Whether a drive has not shown that it is off, by the last name of its control process.
 
         Before a control process gets its first name, it has not communicated with the drive.
@@ -495,16 +522,18 @@ class _SupervisorStop:
         return not {CONNECTING_NAME, SESSION_NAME}.isdisjoint(self._control_name_by_pid.values())
 
     @property
-    def has_shown_off(self) -> bool:
+    def has_shown_torque_off(self) -> bool:
         """Whether every drive that was connected has shown that it is off."""
-        return not self._may_be_on and IDLE_NAME in self._control_name_by_pid.values()
+        return not self._may_have_torque and IDLE_NAME in self._control_name_by_pid.values()
 
     @property
-    def is_over(self) -> bool:
+    def is_session_over(self) -> bool:
         """Whether no session is running, and none can begin any more."""
         if self.process.suspended and self.process.has_pending(STOP_SIGNAL):
             self.suspended = True
-            return all(control_process.name == IDLE_NAME for control_process in self.controls)
+            return all(
+                control_process.name == IDLE_NAME for control_process in self.control_processes
+            )
         has_reacted = time.monotonic() - self._last_signal_s > _SIGNAL_REACTION_TIME_S
         has_obeyed = (
             self._is_signal_sent and has_reacted and not self.process.has_pending(STOP_SIGNAL)
@@ -513,17 +542,17 @@ class _SupervisorStop:
             # Its control process ends after the file was closed. A process without a session may
             # still be planning, but will not begin the session.
             return has_obeyed and not (
-                self.controls and (self._was_session_seen or self._may_be_on)
+                self.control_processes and (self._was_session_seen or self._may_have_torque)
             )
         return not self.has_session and (has_obeyed or not self._is_signal_sent)
 
-    def may_run_rig(self, rig: str) -> bool:
+    def may_run_rig(self, rig_file_name: str) -> bool:
         """Return whether the process may be using a rig, given by its name in file names."""
-        return self._rig is None or file_name(self._rig) == rig
+        return self._rig_name is None or file_name(self._rig_name) == rig_file_name
 
     def send_due_signals(self, elapsed_s: float) -> None:
         """Send the signals that are due, `elapsed_s` seconds after the stop began."""
-        for control_process in self.controls:
+        for control_process in self.control_processes:
             if control_process.suspended:  # a suspended control process leaves its last torque on
                 self._send_unless_ended(control_process, signal.SIGCONT)
         now_s = time.monotonic()
@@ -539,7 +568,7 @@ class _SupervisorStop:
     def _send_stop_signal(self) -> None:
         """Send the process the signal that requests its sessions to stop."""
         process = self.process
-        if process.handles(STOP_SIGNAL) and process not in self.controls:
+        if process.handles(STOP_SIGNAL) and process not in self.control_processes:
             self._is_signal_sent = send_signal(process, self._start_time, STOP_SIGNAL)
         elif not self._is_foreground_command:
             self._stop_control()
@@ -549,7 +578,7 @@ class _SupervisorStop:
 
     def _stop_control(self) -> None:
         """Send SIGTERM to the control processes that are not idle."""
-        for control_process in self.controls:
+        for control_process in self.control_processes:
             if control_process.name != IDLE_NAME:
                 self._send_unless_ended(control_process, signal.SIGTERM)
 
@@ -559,26 +588,30 @@ class _SupervisorStop:
         if start_ticks is not None:
             send_signal(process, start_ticks, signal_number)
 
-    def report_to(self, report: StopReport, *, ended: bool, waited: bool) -> None:
+    def report_to(self, report: StopReport, *, has_ended: bool, is_end_awaited: bool) -> None:
         """Add to a report whether the session of this process has ended."""
-        if not waited and self._had_session:
-            report.stopping.append(self.description)
-        elif not ended:
-            report.running.append(self.description)
-        elif self._may_be_on:
-            report.stopped.append(self.description)
-            report.unconfirmed.append(
+        if not is_end_awaited and self._had_session:
+            report.stopping_sessions.append(self.description)
+        elif not has_ended:
+            report.unended_sessions.append(self.description)
+        elif self._may_have_torque:
+            report.stopped_sessions.append(self.description)
+            report.unconfirmed_drives.append(
                 f"The drive of {self.description} has not shown that it is off."
             )
-        elif self._had_session and not self.has_shown_off:
-            report.quiet.append(f"Stopped before it connected the devices: {self.description}.")
+        elif self._had_session and not self.has_shown_torque_off:
+            report.sentences_without_session.append(
+                f"Stopped before it connected the devices: {self.description}."
+            )
         elif self._had_session:
-            report.stopped.append(self.description)
-        elif self.controls:
-            report.quiet.append(f"No session is running on {self.description}; the torque is off.")
+            report.stopped_sessions.append(self.description)
+        elif self.control_processes:
+            report.sentences_without_session.append(
+                f"No session is running on {self.description}; the torque is off."
+            )
         if self.suspended:
             drive_text = (
-                "; its control process has disabled the drive" if self.has_shown_off else ""
+                "; its control process has disabled the drive" if self.has_shown_torque_off else ""
             )
             report.doubts.append(f"{self.description} is suspended and cannot respond{drive_text}.")
 
@@ -588,7 +621,7 @@ def _find_supervisors(
 ) -> list[tuple[RunningProcess, list[RunningProcess]]]:
     """Return the processes of a table that run sessions, each with its control processes."""
     process_by_pid = {process.pid: process for process in process_table}
-    controls_by_supervisor: dict[int, list[RunningProcess]] = {}
+    control_processes_by_supervisor: dict[int, list[RunningProcess]] = {}
     for process in process_table:
         supervisor_pid = supervisor_of_control(process.command)
         if supervisor_pid is None or process.uid < 0:
@@ -599,23 +632,23 @@ def _find_supervisors(
             process.uid,
             process.parent,
         )
-        controls_by_supervisor.setdefault(
+        control_processes_by_supervisor.setdefault(
             process.pid if is_orphaned else supervisor_pid, []
         ).append(process)
     for process in process_table:
-        arguments = _rigd_arguments(process.command)
-        if process.uid < 0 or arguments[:1] not in [
+        rigd_arguments = _rigd_arguments(process.command)
+        if process.uid < 0 or rigd_arguments[:1] not in [
             (process_name,) for process_name in _SESSION_COMMANDS
         ]:
             continue
         parent_process = process_by_pid.get(process.parent)
         is_forked = parent_process is not None and parent_process.command == process.command
-        only_estimates = "--from" in arguments and not process.handles(STOP_SIGNAL)
-        if not (is_forked or only_estimates or process.ignores(STOP_SIGNAL)):
-            controls_by_supervisor.setdefault(process.pid, [])
+        runs_no_session = "--from" in rigd_arguments and not process.handles(STOP_SIGNAL)
+        if not (is_forked or runs_no_session or process.ignores(STOP_SIGNAL)):
+            control_processes_by_supervisor.setdefault(process.pid, [])
     return [
         (process_by_pid[pid], control_processes)
-        for pid, control_processes in sorted(controls_by_supervisor.items())
+        for pid, control_processes in sorted(control_processes_by_supervisor.items())
     ]
 
 
@@ -631,11 +664,11 @@ def _rigd_arguments(command_line: Sequence[str]) -> tuple[str, ...]:
     return ()
 
 
-def _option_value(arguments: Sequence[str], wanted_option: str) -> str | None:
+def _option_value(arguments: Sequence[str], option_flag: str) -> str | None:
     """Return the value of an option in a command line, or None if the option is absent."""
     for argument_index, argument in enumerate(arguments):
         option_name, equals_sign, option_value = argument.partition("=")
-        if option_name == wanted_option:
+        if option_name == option_flag:
             return (
                 option_value
                 if equals_sign

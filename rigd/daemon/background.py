@@ -51,7 +51,7 @@ class PredictionJob:
 
     profile: Profile
     """Profile of the rig."""
-    excitation: str
+    excitation_kind: str
     """Kind of the excitation, such as "chirp"."""
     parameters: Mapping[str, Value]
     """Parameters of the excitation by their names."""
@@ -59,7 +59,7 @@ class PredictionJob:
     """Whether the torques of motor and sensor may be clipped."""
     specimen: str
     """Name of the specimen, or empty for the beam of the profile."""
-    start_rad: float = 0.0
+    start_angle_rad: float = 0.0
     """Motor angle at the start, relative to the rig's zero."""
     accepted_row_names: tuple[str, ...] = ()
     """Names of rows of `rigd check` that may fail."""
@@ -70,7 +70,9 @@ class PredictionJob:
         """Return the plan and the largest possible amplitude as a dictionary for JSON."""
         profile = with_specimen(self.profile, self.specimen)
         profile = with_tip_slope(profile, self.tip_slope_rad)
-        excitation = excitation_for(profile, self.excitation, self.parameters, self.start_rad)
+        excitation = excitation_for(
+            profile, self.excitation_kind, self.parameters, self.start_angle_rad
+        )
         plan = predict_session(
             profile,
             excitation,
@@ -128,7 +130,7 @@ class PlanJob:
     """Request of the client."""
     folder: Path
     """Folder of the session files."""
-    start_rad: float
+    start_angle_rad: float
     """Motor angle at the start, relative to the rig's zero."""
 
     @property
@@ -157,7 +159,9 @@ class PlanJob:
             profile = with_tip_slope(profile, request.tip_slope_rad)
             return Series(
                 profile,
-                excitation_for(profile, request.excitation, request.parameters, self.start_rad),
+                excitation_for(
+                    profile, request.excitation, request.parameters, self.start_angle_rad
+                ),
                 self.folder,
                 session_count=request.repeat,
                 notes=notes,
@@ -189,19 +193,19 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         If the job is refused, fails, or takes longer than 50 s.
     """
     try:
-        child = ChildProcess(job.worker)
+        child_process = ChildProcess(job.worker)
     except ChildError as error:
         raise CommandError(f"No process can be started for it ({error.system_reason}).") from None
     try:
-        await asyncio.to_thread(child.start, job)
-        performed_job = await asyncio.wait_for(child.receive(), _JOB_TIMEOUT_S)
+        await asyncio.to_thread(child_process.start, job)
+        performed_job = await asyncio.wait_for(child_process.receive(), _JOB_TIMEOUT_S)
     except TimeoutError:
         raise CommandError(f"It takes longer than {_JOB_TIMEOUT_S:g} s; check CPU load.") from None
     except ChildError:
-        await asyncio.to_thread(child.stop)
-        raise CommandError(f"Its process ended with exit code {child.exit_code}.") from None
+        await asyncio.to_thread(child_process.stop)
+        raise CommandError(f"Its process ended with exit code {child_process.exit_code}.") from None
     finally:
-        await asyncio.to_thread(child.stop)
+        await asyncio.to_thread(child_process.stop)
     assert isinstance(performed_job, JobPerformed)
     if isinstance(performed_job.result, CommandError):
         raise performed_job.result
@@ -212,8 +216,8 @@ async def perform(job: BackgroundJob[Result]) -> Result:
 def main() -> None:
     """Receive a job from the daemon, perform it, and send the daemon the result or an error."""
     ignore_signals()
-    daemon = SupervisorConnection()
-    job: BackgroundJob[object] = daemon.receive_job()
+    daemon_connection = SupervisorConnection()
+    job: BackgroundJob[object] = daemon_connection.receive_job()
     result_or_error: object
     try:
         result_or_error = job.perform()
@@ -227,7 +231,7 @@ def main() -> None:
         )
     if isinstance(result_or_error, dict):
         json.dumps(result_or_error, allow_nan=False)  # raises if the reply is not JSON
-    daemon.send(JobPerformed(result_or_error))
+    daemon_connection.send(JobPerformed(result_or_error))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from rigd.daemon.address import peer_of, running
+from rigd.daemon.address import peer_pid_and_uid, running_daemon_sockets
 from rigd.errors import FailureError, RigdError
 from rigd.live.address import LiveAddress
 from rigd.live.address import running as running_views
@@ -42,7 +42,7 @@ _STOP_POLL_INTERVAL_S = 0.1
 """Time in seconds between two checks whether a stop was requested."""
 _TIMEVAL_FORMAT = struct.Struct("@ll")
 """Format of the kernel's time value: seconds and microseconds."""
-UNKNOWN_STATE = (
+UNKNOWN_STATE_ADVICE = (
     "A session may still be running: check the rig, and press the wired stop (STO) if "
     "anything moves."
 )
@@ -58,14 +58,14 @@ class DaemonUnreachableError(FailureError):
     ----------
     message
         Text for the operator.
-    lost_process
+    lost_pid_and_uid
         Process id and user id of a daemon whose connection was lost; None if `message` needs no
         report on the processes that it leaves.
     """
 
-    def __init__(self, message: str, lost_process: tuple[int, int] | None = None) -> None:
+    def __init__(self, message: str, lost_pid_and_uid: tuple[int, int] | None = None) -> None:
         super().__init__(message)
-        self._lost_process = lost_process
+        self._lost_pid_and_uid = lost_pid_and_uid
 
     def full_message(self) -> str:
         """Return the message for the operator; this may take up to 3 s.
@@ -74,8 +74,8 @@ class DaemonUnreachableError(FailureError):
         """
         return (
             str(self)
-            if self._lost_process is None
-            else describe_remaining_processes(*self._lost_process)
+            if self._lost_pid_and_uid is None
+            else describe_remaining_processes(*self._lost_pid_and_uid)
         )
 
 
@@ -102,9 +102,9 @@ class Client:
     ----------
     path
         Path of the daemon's socket.
-    connect_s
+    connect_timeout_s
         Maximum time to connect. The daemon may be suspended, or overloaded by other clients.
-    answer_s
+    reply_timeout_s
         Maximum time to receive a reply.
 
     Attributes
@@ -121,12 +121,12 @@ class Client:
     def __init__(
         self,
         path: Path,
-        connect_s: float = _CONNECT_TIMEOUT_S,
-        answer_s: float = _REPLY_TIMEOUT_S,
+        connect_timeout_s: float = _CONNECT_TIMEOUT_S,
+        reply_timeout_s: float = _REPLY_TIMEOUT_S,
     ) -> None:
         self._path = path
-        self._connect_timeout_s = connect_s
-        self._reply_timeout_s = answer_s
+        self._connect_timeout_s = connect_timeout_s
+        self._reply_timeout_s = reply_timeout_s
         self._events: deque[Document] = deque()
         self._connect()
 
@@ -141,13 +141,13 @@ class Client:
             )
             new_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, packed_timeout)
             new_socket.connect(str(self._path))
-            self.pid, self.uid = peer_of(new_socket)
+            self.pid, self.uid = peer_pid_and_uid(new_socket)
         except BlockingIOError:
             new_socket.close()
             raise DaemonUnreachableError(
                 f"The daemon on {self._path} accepts no connection within "
                 f"{self._connect_timeout_s:g} s: it is suspended, or overloaded by other clients. "
-                f"{UNKNOWN_STATE}"
+                f"{UNKNOWN_STATE_ADVICE}"
             ) from None
         except OSError as error:
             new_socket.close()
@@ -173,7 +173,7 @@ class Client:
     def ask(self, command: str, **fields: object) -> Document:
         """Send a request to the daemon, and return its reply.
 
-        Events that arrive meanwhile are stored for :meth:`event`. If the daemon has too many
+        Events that arrive meanwhile are stored for :meth:`next_event`. If the daemon has too many
         clients, the request is repeated.
 
         Parameters
@@ -259,7 +259,7 @@ class Client:
                 return reply_message
         raise DaemonUnreachableError(
             f"The daemon (process {self.pid}) does not answer within {self._reply_timeout_s:g} s. "
-            f"{UNKNOWN_STATE}"
+            f"{UNKNOWN_STATE_ADVICE}"
         )
 
     def send(self, command: str, **fields: object) -> None:
@@ -286,7 +286,7 @@ class Client:
             self._raise_refusal()
             raise self._connection_lost_error() from None
 
-    def event(self, timeout_s: float) -> Document | None:
+    def next_event(self, timeout_s: float) -> Document | None:
         """Return the next event or reply of the daemon, or None if none arrives in time.
 
         Raises
@@ -377,37 +377,38 @@ def stop_session(path: Path) -> Document:
     DaemonUnreachableError
         If the daemon does not confirm the stop within 10 s. The message states what was done.
     """
-    began_s = time.monotonic()
-    peer: tuple[int, int] | None = None
-    signalled = False
+    stop_begin_s = time.monotonic()
+    pid_and_uid: tuple[int, int] | None = None
+    is_stop_signalled = False
     reply_timeout_s = _FIRST_STOP_REPLY_TIMEOUT_S
     while True:
         try:
             with Client(path, reply_timeout_s, reply_timeout_s) as client:
-                peer = client.pid, client.uid
-                return client.ask("stop") | {"signalled": signalled, "peer": peer}
+                pid_and_uid = client.pid, client.uid
+                return client.ask("stop") | {"signalled": is_stop_signalled, "peer": pid_and_uid}
         except (DaemonUnreachableError, _TooManyClientsError) as error:
             last_failure = str(error)
-        elapsed_s = time.monotonic() - began_s
-        if peer is not None and not signalled and elapsed_s > _STOP_SIGNAL_DELAY_S:
-            signalled = _signal_stop(peer[0])
+        elapsed_s = time.monotonic() - stop_begin_s
+        if pid_and_uid is not None and not is_stop_signalled and elapsed_s > _STOP_SIGNAL_DELAY_S:
+            is_stop_signalled = _signal_stop(pid_and_uid[0])
         if elapsed_s > _STOP_TIMEOUT_S or not path.exists():
             break
         # A daemon that lacks processor time stops its session, but replies late.
         reply_timeout_s = min(2.0 * reply_timeout_s, _STOP_TIMEOUT_S)
         time.sleep(_RETRY_PAUSE_S)
-    if peer is None:
+    if pid_and_uid is None:
         raise DaemonUnreachableError(last_failure)
-    if not signalled:
-        raise DaemonUnreachableError(last_failure, peer)
+    if not is_stop_signalled:
+        raise DaemonUnreachableError(last_failure, pid_and_uid)
     raise DaemonUnreachableError(
-        f"The daemon (process {peer[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
-        f"has not replied for {elapsed_s:.0f} s. {UNKNOWN_STATE}"
+        f"The daemon (process {pid_and_uid[0]}) was sent {STOP_SIGNAL.name}, which asks it to "
+        "stop, and "
+        f"has not replied for {elapsed_s:.0f} s. {UNKNOWN_STATE_ADVICE}"
     )
 
 
-def await_end(
-    path: Path, patience_s: float, peer: tuple[int, int] | None = None
+def await_series_end(
+    path: Path, timeout_s: float, pid_and_uid: tuple[int, int] | None = None
 ) -> Document | None:
     """Wait until a daemon reports that no session is running, and return its status.
 
@@ -415,9 +416,9 @@ def await_end(
     ----------
     path
         Path of the daemon's socket.
-    patience_s
+    timeout_s
         Maximum time to wait.
-    peer
+    pid_and_uid
         Process id and user id of the daemon that must reply, or None for any.
 
     Returns
@@ -431,10 +432,12 @@ def await_end(
     RefusedByDaemonError, DaemonUnreachableError
         If the daemon no longer replies.
     """
-    deadline_s = time.monotonic() + patience_s
-    with Client(path, answer_s=patience_s) as client:
-        if peer not in (None, (client.pid, client.uid)):
-            raise DaemonUnreachableError(f"Another process listens on {path} now. {UNKNOWN_STATE}")
+    deadline_s = time.monotonic() + timeout_s
+    with Client(path, reply_timeout_s=timeout_s) as client:
+        if pid_and_uid not in (None, (client.pid, client.uid)):
+            raise DaemonUnreachableError(
+                f"Another process listens on {path} now. {UNKNOWN_STATE_ADVICE}"
+            )
         while True:
             try:
                 daemon_status = client.ask("status")
@@ -472,7 +475,7 @@ def describe_remaining_processes(pid: int, uid: int) -> str:
     if is_daemon_running:
         return (
             f"The connection to the daemon (process {pid}) is lost, though it runs; see rigd "
-            f"status. {UNKNOWN_STATE}"
+            f"status. {UNKNOWN_STATE_ADVICE}"
         )
     restart_advice = "see the daemon's log for the cause, and start it again with rigd serve."
     if control_processes:
@@ -481,7 +484,7 @@ def describe_remaining_processes(pid: int, uid: int) -> str:
             "still runs and may move the motor: press the wired stop (STO). Then " + restart_advice
         )
     if uid != os.getuid() and not _sees_other_users():
-        return f"The daemon is gone (process {pid}). {UNKNOWN_STATE} Then {restart_advice}"
+        return f"The daemon is gone (process {pid}). {UNKNOWN_STATE_ADVICE} Then {restart_advice}"
     return (
         "The daemon is gone. Its control process, which alone moves the motor, has ended too: "
         "check that the rig is at rest. What was recorded of a session is in the daemon's output "
@@ -531,40 +534,44 @@ def _signal_stop(pid: int) -> bool:
     process = read_process(pid)
     if process is None or not process.handles(STOP_SIGNAL):
         return False
-    start_time = process.start_ticks
-    return start_time is not None and send_signal(process, start_time, STOP_SIGNAL)
+    start_ticks = process.start_ticks
+    return start_ticks is not None and send_signal(process, start_ticks, STOP_SIGNAL)
 
 
 # Running daemons
 
 
-def find_views(rig: str | None) -> list[LiveAddress]:
+def find_live_views(rig_name: str | None) -> list[LiveAddress]:
     """Return the addresses of the live views of a rig, or of all rigs.
 
     Parameters
     ----------
-    rig
+    rig_name
         Name of the rig's profile, or None for all rigs.
     """
     own_views = running_views()
-    matching_views = [live_view for live_view in own_views if rig in (None, live_view.rig)]
+    matching_views = [live_view for live_view in own_views if rig_name in (None, live_view.rig)]
     if not matching_views:
         # The runtime folder of another user's daemon is not readable.
-        daemon_views = (_view_of_daemon(daemon_socket) for daemon_socket in running())
+        daemon_views = (
+            _view_of_daemon(daemon_socket) for daemon_socket in running_daemon_sockets()
+        )
         matching_views = [
             live_view
             for live_view in daemon_views
-            if live_view is not None and rig in (None, live_view.rig)
+            if live_view is not None and rig_name in (None, live_view.rig)
         ]
     return matching_views
 
 
-def daemons() -> dict[str, bool]:
+def daemons_with_view() -> dict[str, bool]:
     """Return the rigs with a running daemon: name of the rig → whether it has a live view."""
-    statuses = (_status_of_daemon(daemon_socket) for daemon_socket in running())
+    daemon_statuses = (
+        _status_of_daemon(daemon_socket) for daemon_socket in running_daemon_sockets()
+    )
     return {
         daemon_status["daemon"]["profile"]: daemon_status["daemon"]["live"]
-        for daemon_status in statuses
+        for daemon_status in daemon_statuses
         if daemon_status is not None
     }
 

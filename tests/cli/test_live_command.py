@@ -163,7 +163,7 @@ class Window:
 def test_window_reconnects_to_later_views(rigd_here, view, monkeypatch):
     second, third = replace(view, server=2), replace(view, server=3, grpc_port=1234)
     there = iter([[view], [view], [view], [second], [], [], [third], [third], [third]])
-    monkeypatch.setattr("rigd.daemon.client.find_views", lambda rig: next(there))
+    monkeypatch.setattr("rigd.daemon.client.find_live_views", lambda rig: next(there))
     monkeypatch.setattr("time.sleep", lambda _: None)
     monkeypatch.setattr("rigd.cli.live.has_screen", lambda: True)
     window = Window(polls=8)
@@ -201,7 +201,7 @@ def test_view_is_found_through_the_daemon_without_its_file(
 
 
 def test_error_names_a_daemon_with_a_pending_view(rigd_here, monkeypatch):
-    monkeypatch.setattr("rigd.daemon.client.daemons", lambda: {"sim": True})
+    monkeypatch.setattr("rigd.daemon.client.daemons_with_view", lambda: {"sim": True})
     done = rigd_here("live")
     assert done.returncode == 1
     assert "The daemon of the rig sim has no live view at the moment" in done.stderr

@@ -36,7 +36,7 @@ class Client:
         self.events = list(events)
         self.sent = []
 
-    def event(self, _timeout_s):
+    def next_event(self, _timeout_s):
         event = self.events.pop(0) if self.events else None
         if isinstance(event, int):
             self.interrupts.count += event

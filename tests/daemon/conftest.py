@@ -70,12 +70,12 @@ def stop_here(runtime_folder, rigd_here, monkeypatch):
 
         return [process for process in rows.values() if is_own(process)]
 
-    own_sockets = stop_module.own_sockets
+    own_daemon_sockets = stop_module.own_daemon_sockets
 
     def sockets():
-        return [path for path in own_sockets() if runtime_folder in path.parents]
+        return [path for path in own_daemon_sockets() if runtime_folder in path.parents]
 
-    monkeypatch.setattr(stop_module, "own_sockets", sockets)
+    monkeypatch.setattr(stop_module, "own_daemon_sockets", sockets)
     monkeypatch.setattr(stop_module, "known_folders", lambda _: [runtime_folder / "rigd"])
     monkeypatch.setattr(stop_module, "GROUP_FOLDER", runtime_folder / "common")
 

@@ -17,7 +17,7 @@ from rigd.daemon.client import (
     Client,
     DaemonUnreachableError,
     RefusedByDaemonError,
-    await_end,
+    await_series_end,
     stop_session,
 )
 from rigd.runtime import STOP_SIGNAL
@@ -94,7 +94,7 @@ def test_wait_for_a_full_queue_is_limited(path):
         listener.listen(0)
         first.connect(str(path))
         with pytest.raises(DaemonUnreachableError, match=r"suspended.*may still be running.*STO"):
-            Client(path, connect_s=0.05)
+            Client(path, connect_timeout_s=0.05)
 
 
 UNRESPONSIVE_PROGRAM = """
@@ -241,7 +241,7 @@ def test_await_end_waits_for_the_last_state(path, last):
             file.readline()
 
     threading.Thread(target=work, daemon=True).start()
-    status = await_end(path, 30.0)
+    status = await_series_end(path, 30.0)
     assert status is not None
     assert status["state"] == "ready"
     listener.close()
@@ -270,9 +270,9 @@ def test_await_end_claims_nothing_without_a_status(path, monkeypatch):
     links = []
     threading.Thread(target=work, daemon=True).start()
     began_s = time.monotonic()
-    assert await_end(path, 0.1) is None
+    assert await_series_end(path, 0.1) is None
     crowded.clear()
     with pytest.raises(DaemonUnreachableError, match="may still be running"):
-        await_end(path, 0.1)
+        await_series_end(path, 0.1)
     assert time.monotonic() - began_s < 30.0  # and not the minute of other answers
     listener.close()

@@ -17,7 +17,13 @@ import pytest
 
 from rigd.daemon import _server as server
 from rigd.daemon import address
-from rigd.daemon.address import AddressError, UnknownGroupError, find, running, socket_path
+from rigd.daemon.address import (
+    AddressError,
+    UnknownGroupError,
+    find_daemon_socket,
+    running_daemon_sockets,
+    socket_path,
+)
 from rigd.runner import signal_blocks
 from rigd.runtime.addresses import socket_answers
 
@@ -63,7 +69,7 @@ class Served:
     def __init__(self, operated, path):
         self.operated = operated
         self.path = path
-        self.server = server.Server(address.bind(path, None))
+        self.server = server.Server(address.bind_daemon_socket(path, None))
         operated.service._publish = self.server.publish
         self.links = []
 
@@ -322,16 +328,16 @@ def mode(path):
 def test_socket_belongs_to_its_user(runtime_folder):
     path = socket_path("my rig/2")
     assert path.parent == runtime_folder / "rigd"
-    listener = address.bind(path, None)
+    listener = address.bind_daemon_socket(path, None)
     assert mode(path) == 0o600
     assert mode(path.parent) == 0o700
     assert not socket_answers(path)  # not before it listens
     listener.listen(5)
     assert socket_answers(path)
     with pytest.raises(AddressError, match="Another daemon"):
-        address.bind(path, None)
+        address.bind_daemon_socket(path, None)
     listener.close()
-    with address.bind(path, None):  # what a dead daemon left
+    with address.bind_daemon_socket(path, None):  # what a dead daemon left
         assert not socket_answers(path)
 
 
@@ -340,55 +346,55 @@ def test_socket_of_a_group(runtime_folder):
     common = runtime_folder / "common"
     path = socket_path("sim", common)
     with pytest.raises(AddressError, match=f"install -d -o .* -g {group} .*{common}"):
-        address.bind(path, group)
+        address.bind_daemon_socket(path, group)
     assert not common.exists()  # it is the administrator's to make
     common.mkdir(mode=0o700)
     with pytest.raises(AddressError, match=f"closed to the group {group}"):
-        address.bind(path, group)
+        address.bind_daemon_socket(path, group)
     common.chmod(0o710)
     common.chmod(0o2770)
     with pytest.raises(AddressError, match=f"{common} is writable by its group"):
-        address.bind(path, group)
+        address.bind_daemon_socket(path, group)
     common.chmod(0o710)
-    with address.bind(path, group):
+    with address.bind_daemon_socket(path, group):
         assert mode(path) == 0o660
         assert path.stat().st_gid == os.getgid()
     with pytest.raises(UnknownGroupError, match="no such group"):
-        address.bind(path, "nobody-has-this-group")
+        address.bind_daemon_socket(path, "nobody-has-this-group")
 
 
 def test_error_with_remedy_for_an_impossible_folder(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(AddressError, match="XDG_RUNTIME_DIR"):
-        address.bind(tmp_path / "file" / "sim.daemon", None)
+        address.bind_daemon_socket(tmp_path / "file" / "sim.daemon", None)
     with pytest.raises(AddressError, match="XDG_RUNTIME_DIR"):
-        address.bind(tmp_path / ("x" * 120) / "sim.daemon", None)
+        address.bind_daemon_socket(tmp_path / ("x" * 120) / "sim.daemon", None)
 
 
 def test_daemons_are_found(runtime_folder, monkeypatch):
     monkeypatch.setattr(address, "GROUP_FOLDER", runtime_folder / "common")
     with pytest.raises(AddressError, match="rigd serve"):
-        find(None)
+        find_daemon_socket(None)
     with (
-        address.bind(socket_path("one"), None) as one,
-        address.bind(socket_path("two"), None) as two,
+        address.bind_daemon_socket(socket_path("one"), None) as one,
+        address.bind_daemon_socket(socket_path("two"), None) as two,
     ):
         one.listen(5)
-        assert find(None) == socket_path("one")  # the other one is dead
+        assert find_daemon_socket(None) == socket_path("one")  # the other one is dead
         two.listen(5)
-        assert running() == [socket_path("one"), socket_path("two")]
+        assert running_daemon_sockets() == [socket_path("one"), socket_path("two")]
         with pytest.raises(AddressError, match=r"one, two.*--profile"):
-            find(None)
-        assert find("two") == socket_path("two")
+            find_daemon_socket(None)
+        assert find_daemon_socket("two") == socket_path("two")
         with pytest.raises(AddressError, match="rigd serve --profile three"):
-            find("three")
+            find_daemon_socket("three")
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime_folder / "rigd"))
         elsewhere = f"one listens on {socket_path('one', runtime_folder / 'rigd')}"
         with pytest.raises(AddressError, match=elsewhere):
-            find("one")
+            find_daemon_socket("one")
         monkeypatch.undo()
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime_folder))
-        assert isinstance(find("one"), Path)
+        assert isinstance(find_daemon_socket("one"), Path)
 
 
 def test_signals_are_sent_to_their_subscribers_only(served, monkeypatch):

@@ -53,7 +53,7 @@ def everything_is_requested(operated, drive):
 
 
 def client_leaves(operated, drive):
-    operated.service.release(operated.peer)
+    operated.service.release_control(operated.peer)
 
 
 INCIDENTS = (
@@ -150,7 +150,7 @@ def make_machine(operate):
                 self.operated.service.controller == self.operated.peer
                 and self.operated.state == "ready"
             )
-            self.operated.service.release(self.operated.peer)
+            self.operated.service.release_control(self.operated.peer)
             self.operated.peer = self.operated.service.controller or self.operated.peer
 
         @rule()

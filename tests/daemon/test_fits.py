@@ -16,7 +16,7 @@ from rigd.runner.session import SessionProgress, SessionResult
 def reported_series():
     """A started series, its reporter, and the published events."""
     request = b'{"command": "start", "excitation": "chirp", "watch_fit": true}'
-    series, events = ServedSeries(1, parse_request(request), running=True), []
+    series, events = ServedSeries(1, parse_request(request), is_running=True), []
     reporter = SeriesReporter(series, events.append, lambda: True)
     reporter.on_start(1, Path("1.mcap"))
     return series, reporter, events

@@ -161,15 +161,15 @@ def test_control_belongs_to_one_client_until_it_leaves(operated):
     assert "controlled by process 100 of" in str(refusal)
     assert operated.service.status()["controller"]["pid"] == 100
     assert operated.request("status", peer=OTHER)["state"] == "ready"
-    operated.service.release(OTHER)
+    operated.service.release_control(OTHER)
     assert isinstance(operated.request("zero", peer=OTHER), CommandError)
-    operated.service.release(operated.peer)
+    operated.service.release_control(operated.peer)
     assert "moved_rad" in operated.request("zero", peer=OTHER)
 
 
 def test_disconnecting_client_stops_nothing(operated):
     def leave(drive):
-        operated.service.release(operated.peer)
+        operated.service.release_control(operated.peer)
 
     operated.world.countdown, operated.world.then = 500, leave
     operated.request("start", **SHORT)

@@ -10,7 +10,7 @@ import zlib
 import pytest
 from web_daemon import TOKEN, rig_with_page
 
-from rigd.daemon.address import find
+from rigd.daemon.address import find_daemon_socket
 from rigd.daemon.client import Client
 
 START = json.dumps({"command": "start", "excitation": "chirp"}).encode()
@@ -350,7 +350,7 @@ def test_real_daemon_refuses_all_and_runs_a_session_afterwards(rig):
         assert 400 <= status < 500, (method, target, status)
         assert not any(secret in answer for secret in (SECRET, b"root:", rig.token.encode()))
 
-    with Client(find(rig.name)) as client:
+    with Client(find_daemon_socket(rig.name)) as client:
 
         def status():
             document = client.ask("status")
