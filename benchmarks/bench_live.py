@@ -99,7 +99,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
         order = SessionOrder(profile, excitation, Path(folder) / "bench.mcap")
         meters, stop = [], StopRequest()
         if live:
-            rig.show(order, stop)
+            rig.show_session(order, stop)
             pid = group[LIVE].pid
             meters = [Meter(pid), Meter(child_of(pid))]
 

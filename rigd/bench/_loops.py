@@ -169,7 +169,7 @@ def run_session(
         usage_meter = UsageMeter(process_group.control.pid)
         stop_request = StopRequest()
         if with_live_view:
-            rig.show(session_order, stop_request)
+            rig.show_session(session_order, stop_request)
 
         def on_progress(progress: SessionProgress, _: object) -> None:
             usage_meter.sample_usage(progress.phase)

@@ -39,12 +39,12 @@ def probe(
         )
     finally:
         ignore_end_signals()
-    contradiction_text = probe_result.contradiction(rig_profile)
+    contradiction_text = probe_result.contradiction_text(rig_profile)
     if as_json:
         json_document = {"end": probe_result.end.name.lower(), **probe_result.estimate.as_dict()}
         typer.echo(json.dumps(json_document | {"contradiction": contradiction_text}))
     else:
-        typer.echo("\n".join(probe_result.lines(rig_profile)))
+        typer.echo("\n".join(probe_result.text_lines(rig_profile)))
         typer.echo(contradiction_text or "The rig agrees with its profile.")
     if contradiction_text:
         raise typer.Exit(EXIT_FAILED)

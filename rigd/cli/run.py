@@ -266,7 +266,7 @@ def run_sessions(
             tip_slope_rad=tip_slope_rad,
             quiet_stdout=as_json,
             force_hardware=hardware,
-            quick_look=not no_quick_look,
+            with_quick_looks=not no_quick_look,
             obstacles=obstacle or (),
             starts_at_present_angle=kind in ("move", "touch"),
             watch_fit=watch_fit,

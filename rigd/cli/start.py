@@ -250,8 +250,8 @@ def _follow_series(
                         Phase[daemon_event["phase"].upper()],
                         daemon_event["tick"],
                         daemon_event["total"],
-                        missed=daemon_event["missed"],
-                        late=daemon_event["late"],
+                        missed_ticks=daemon_event["missed"],
+                        late_ticks=daemon_event["late"],
                         session_number_text=f"{daemon_event['session']}/{daemon_event['repeat']}"
                         if daemon_event["repeat"] > 1
                         else "",

@@ -126,8 +126,8 @@ class SeriesReporter:
         self._series.session_number, self._series.session_path = session_number, session_path
         self._series.last_fit = None
 
-    def on_message(self, level: str, text: str) -> None:
-        self._report(level, text, is_notable=True)
+    def on_message(self, level: str, message_text: str) -> None:
+        self._report(level, message_text, is_notable=True)
 
     def on_live_view(self, view_text: str) -> None:
         self._report("info", view_text)

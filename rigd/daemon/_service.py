@@ -311,7 +311,7 @@ class Service:
         ):
             return
         try:
-            await self._call_in_worker(self._rig.watch)
+            await self._call_in_worker(self._rig.check_control_process)
         except RigError as error:
             if not self._is_closing and self.state is DaemonState.READY:
                 self._state_machine.change_to(DaemonState.FAULT, str(error))
@@ -455,7 +455,7 @@ class Service:
         try:
             if self._rig.connected:
                 try:
-                    await self._call_in_worker(self._rig.watch)
+                    await self._call_in_worker(self._rig.check_control_process)
                 except RigError:
                     pass  # the rig was disconnected, and is connected again below
                 else:

@@ -31,7 +31,7 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
     """
     limits = plan.get("limits", {})
 
-    def peak(peak_name: str, unit: str) -> str:
+    def peak_text(peak_name: str, unit: str) -> str:
         limit_text = f" (limit {limits[peak_name]:g})" if peak_name in limits else ""
         return f"{plan[f'peak_{peak_name}']:.3g} {unit}{limit_text}"
 
@@ -40,8 +40,8 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
     maximum_prefix = "at most " if plan.get("ends_itself") else ""
     yield f"{subject_prefix}{sweep_prefix}record of {maximum_prefix}{plan['record_s']:g} s."
     yield (
-        f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
-        f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
+        f"Predicted peaks: angle {peak_text('angle_rad', 'rad')}, "
+        f"speed {peak_text('velocity_rad_s', 'rad/s')}, torque {peak_text('torque_nm', 'N·m')}."
     )
     for key in ("specimen_in_words", "tip_in_words"):
         if plan.get(key):
@@ -50,22 +50,24 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
         yield f"Warning: {warning}"
 
 
-def result_line(session: Mapping[str, Any]) -> str:
+def result_line(session_document: Mapping[str, Any]) -> str:
     """Return one line that states how a session ended.
 
     Parameters
     ----------
-    session
+    session_document
         Result of the session, from :meth:`rigd.runner.session.SessionResult.as_dict`.
     """
-    outcome = session["outcome"].capitalize()
-    reason = f" {session['reason']}" if session["reason"] else ""
-    if session["part"] is not None:
-        return f"{outcome}: file incomplete, {session['part']}.{reason}"
-    if session["path"] is None:
-        return f"{outcome}: no record.{reason}"
-    touches = "".join(f" {touch_line(touch)}." for touch in session.get("touches", []))
-    return f"{outcome}: {counts_text(session)}.{reason}{touches}"
+    outcome_text = session_document["outcome"].capitalize()
+    reason_text = f" {session_document['reason']}" if session_document["reason"] else ""
+    if session_document["part"] is not None:
+        return f"{outcome_text}: file incomplete, {session_document['part']}.{reason_text}"
+    if session_document["path"] is None:
+        return f"{outcome_text}: no record.{reason_text}"
+    touches_text = "".join(
+        f" {touch_line(touch)}." for touch in session_document.get("touches", [])
+    )
+    return f"{outcome_text}: {counts_text(session_document)}.{reason_text}{touches_text}"
 
 
 class ProgressLine:
@@ -94,10 +96,10 @@ class ProgressLine:
         self,
         phase: Phase,
         tick: int,
-        total: int,
+        total_ticks: int,
         *,
-        missed: int,
-        late: int,
+        missed_ticks: int,
+        late_ticks: int,
         session_number_text: str = "",
     ) -> None:
         """Show the present progress of the session.
@@ -106,9 +108,9 @@ class ProgressLine:
         ----------
         phase
             Phase of the control process.
-        tick, total
+        tick, total_ticks
             Number of ticks that were due so far, and total number of ticks of the record.
-        missed, late
+        missed_ticks, late_ticks
             Number of missed ticks and of late ticks so far. They are shown only if a tick was
             missed.
         session_number_text
@@ -119,8 +121,8 @@ class ProgressLine:
         self._state = {
             "description": f"{phase.display_text} {session_number_text}".rstrip(),
             "completed": tick if self._has_record_begun else 0,
-            "total": total,
-            "counts": f"{missed} missed, {late} late" if missed else "",
+            "total": total_ticks,
+            "counts": f"{missed_ticks} missed, {late_ticks} late" if missed_ticks else "",
         }
         now_s = time.monotonic()
         if now_s >= self._next_redraw_s:

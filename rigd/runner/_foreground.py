@@ -74,7 +74,7 @@ def run_in_foreground(
     accepted_row_names: Sequence[str] = (),
     quiet_stdout: bool,
     force_hardware: bool = False,
-    quick_look: bool = False,
+    with_quick_looks: bool = False,
     starts_at_present_angle: bool = False,
     prepare_profile: Callable[[Profile], Profile] | None = None,
     obstacles: Sequence[str] = (),
@@ -104,11 +104,11 @@ def run_in_foreground(
         until the beam is at rest.
     quiet_stdout
         Print all text to standard error, because standard output is reserved for a JSON document.
-    quick_look
+    with_quick_looks
         Make a quick look at each session, and wait some seconds for the last one.
     starts_at_present_angle
         Whether the excitation depends on the present motor angle. The rig is then connected before
-        planning, and `build_excitation` receives the angle as ``start_rad``.
+        planning, and `build_excitation` receives the angle as ``start_angle_rad``.
     prepare_profile
         Function that returns a modified profile before the sessions are planned.
     obstacles
@@ -130,12 +130,12 @@ def run_in_foreground(
     print_line: _PrintLine = partial(_print, to_stderr=quiet_stdout)
     results: list[SessionResult] = []
 
-    def report(quick_look: QuickLook) -> None:
+    def print_quick_look(quick_look: QuickLook) -> None:
         quick_look.add_path_to_results(results)
         for report_line in quick_look.lines:
             print_line(report_line)
 
-    quick_looks = QuickLookQueue(report) if quick_look else None
+    quick_looks = QuickLookQueue(print_quick_look) if with_quick_looks else None
     try:
         # The lock of the rig is released last, when no process uses the devices any more.
         with contextlib.ExitStack() as locks, group:
@@ -165,7 +165,7 @@ def run_in_foreground(
             rig = Rig(profile, uses_virtual_clock=uses_virtual_clock, group=group)
             if starts_at_present_angle and not stop.requested:
                 rig.connect(target)
-                build_excitation = partial(build_excitation, start_rad=rig.angle_rad)
+                build_excitation = partial(build_excitation, start_angle_rad=rig.angle_rad)
             session_series = Series(
                 specimen_profile,
                 build_excitation(specimen_profile),
@@ -221,14 +221,14 @@ class _TerminalProgress:
     def __exit__(self, *_: object) -> None:
         self._close()
 
-    def on_start(self, number: int, path: Path) -> None:  # noqa: ARG002 - printed when it exists
+    def on_start(self, session_number: int, session_path: Path) -> None:  # noqa: ARG002 - printed when it exists
         self._session_number_text = (
-            f"{number}/{self._session_count}" if self._session_count > 1 else ""
+            f"{session_number}/{self._session_count}" if self._session_count > 1 else ""
         )
         self._progress_line = ProgressLine()
 
-    def on_message(self, level: str, text: str) -> None:
-        self._print(f"Warning: {text}" if level == "warning" else text)
+    def on_message(self, level: str, message_text: str) -> None:
+        self._print(f"Warning: {message_text}" if level == "warning" else message_text)
 
     def on_live_view(self, view_text: str) -> None:
         if view_text != self._last_view_text:
@@ -246,8 +246,8 @@ class _TerminalProgress:
             progress.phase,
             progress.tick,
             self._record_ticks,
-            missed=progress.missed,
-            late=progress.late,
+            missed_ticks=progress.missed,
+            late_ticks=progress.late,
             session_number_text=self._session_number_text,
         )
 
@@ -265,10 +265,10 @@ class _TerminalProgress:
             self._progress_line = None
 
 
-def _print(text: str, *, to_stderr: bool) -> None:
+def _print(printed_text: str, *, to_stderr: bool) -> None:
     """Print a line to standard error if `to_stderr` is True, else to standard output."""
     with contextlib.suppress(OSError):  # the session continues without a terminal
-        typer.echo(text, err=to_stderr)
+        typer.echo(printed_text, err=to_stderr)
 
 
 def _await_quick_looks(quick_looks: QuickLookQueue, stop: StopRequest) -> None:
@@ -276,11 +276,11 @@ def _await_quick_looks(quick_looks: QuickLookQueue, stop: StopRequest) -> None:
     stop.ignore_stop_signal()
     was_stopped, is_skipped = stop.requested, False
 
-    def skip() -> None:
+    def skip_quick_looks() -> None:
         nonlocal is_skipped
         is_skipped = True
 
-    stop.on_request = skip
+    stop.on_request = skip_quick_looks
     quick_looks.poll()
     if quick_looks.busy:
         _print("Quick look at the session; Ctrl-C skips it.", to_stderr=True)
@@ -294,13 +294,14 @@ def _await_quick_looks(quick_looks: QuickLookQueue, stop: StopRequest) -> None:
         time.sleep(_POLL_S)
         quick_looks.poll()
     if quick_looks.busy and not is_skipped:
-        reason = (
+        skip_reason = (
             "took too long"
             if quick_looks.run_time_s >= _QUICK_LOOK_MAX_RUN_TIME_S
             else "got no processor time"
         )
         _print(
-            f"The quick look {reason} and was skipped: python -m analysis.quick_look FILE makes "
+            f"The quick look {skip_reason} and was skipped: python -m analysis.quick_look FILE "
+            "makes "
             "it.",
             to_stderr=True,
         )
@@ -314,8 +315,9 @@ def _print_stop_message(results: Sequence[SessionResult], session_count: int) ->
     """
     if len(results) == session_count or any(not result.is_successful for result in results):
         return
-    count_text = f" after {len(results)} of {session_count} sessions" if results else ""
+    session_count_text = f" after {len(results)} of {session_count} sessions" if results else ""
     _print(
-        f"Stopped: no record{count_text}. Stopped by the operator before the session began.",
+        f"Stopped: no record{session_count_text}. Stopped by the operator before the session "
+        "began.",
         to_stderr=True,
     )

@@ -53,7 +53,7 @@ class LiveViewClient(WorkerClient):
         self._is_session_shown = False
         self._restart()
 
-    def show(self, order: SessionOrder, stop: StopRequest) -> str:
+    def show_session(self, session_order: SessionOrder, stop: StopRequest) -> str:
         """Prepare the view for the next session; return its address, or text on why it has none."""
 
         def is_not_stopped() -> bool:
@@ -63,12 +63,12 @@ class LiveViewClient(WorkerClient):
         if self.failure:  # a new attempt for the new session
             self._restart()
         self._wait(lambda: self._is_ready, _ADDRESS_TIMEOUT_S, is_not_stopped)
-        start_positions = tuple(ring.written_count for ring in self._group.channels.rings)
+        start_ring_positions = tuple(ring.written_count for ring in self._group.channels.rings)
         self._session = LiveSession(
-            describe_planned_session(order, uses_virtual_clock=self._uses_virtual_clock),
+            describe_planned_session(session_order, uses_virtual_clock=self._uses_virtual_clock),
             str(uuid.uuid4()),
-            start_positions,
-            order.path.parent,
+            start_ring_positions,
+            session_order.path.parent,
         )
         self._is_session_shown = False
         self._send(self._session)
@@ -94,8 +94,8 @@ class LiveViewClient(WorkerClient):
         """Show how the current session ended; pass empty texts if that is unknown."""
         if self._session is not None:
             self._session = None
-            end_positions = tuple(ring.written_count for ring in self._group.channels.rings)
-            self._send(LiveSessionEnded(end_positions, outcome, reason))
+            end_ring_positions = tuple(ring.written_count for ring in self._group.channels.rings)
+            self._send(LiveSessionEnded(end_ring_positions, outcome, reason))
 
     def _restart(self) -> None:
         """Start a publisher process, and send it the rig and the current session."""
@@ -127,17 +127,17 @@ class LiveViewClient(WorkerClient):
 
 
 def describe_planned_session(
-    order: SessionOrder, *, uses_virtual_clock: bool = False
+    session_order: SessionOrder, *, uses_virtual_clock: bool = False
 ) -> SessionDescription:
     """Return the data of a session that the live view shows, such as beam, sweep and limits."""
-    rig_parameters, excitation = order.profile.rig, order.excitation
+    rig_parameters, excitation = session_order.profile.rig, session_order.excitation
     absent_plots: set[str] = set()
     if rig_parameters.devices.drive == rig_parameters.devices.sensor == "sim":
         absent_plots |= BUS_PLOT_COMPONENTS
     if uses_virtual_clock:
         absent_plots |= REAL_TIME_PLOT_COMPONENTS
     return SessionDescription(
-        name=order.path.stem,
+        name=session_order.path.stem,
         rate_hz=rig_parameters.rate_hz,
         ticks=excitation.reference_rad.size,
         sweep=sweep_ticks(excitation.segments),
@@ -149,29 +149,31 @@ def describe_planned_session(
         excitation=excitation.kind,
         sweep_hz=linear_sweep_band_hz(excitation.kind, excitation.parameters),
         back=excitation.segments.get("back"),
-        specimen=dict(order.notes).get("specimen", ""),
-        limits=gauge_limits(order.profile),
+        specimen=dict(session_order.notes).get("specimen", ""),
+        limits=gauge_limits(session_order.profile),
         thermal_time_constant_s=rig_parameters.motor.thermal_time_constant_s,
         absent=frozenset(absent_plots),
-        fit_modes=_fit_modes(order),
+        fit_modes=_fit_mode_count(session_order),
     )
 
 
-def _fit_modes(order: SessionOrder) -> int | None:
+def _fit_mode_count(session_order: SessionOrder) -> int | None:
     """Return the number of modes expected in the excited band, whose fits are plotted.
 
     Returns None if the session makes no fits.
     """
-    excitation = order.excitation
-    if not order.makes_fits:
+    excitation = session_order.excitation
+    if not session_order.makes_fits:
         return None
-    sweep_limits = (
+    sweep_limits_hz = (
         excitation.parameters.get(frequency_key, _DEFAULT_FIT_BAND_HZ)
         for frequency_key in ("start_hz", "stop_hz")
     )
-    highest_hz = max(float(end) for end in sweep_limits)
-    expected_hz = undamped_frequencies_rad_s(order.profile.rig.beam, _MAX_FIT_MODES) / math.tau
-    return max(1, int(np.count_nonzero(expected_hz < highest_hz)))
+    highest_fit_frequency_hz = max(float(end) for end in sweep_limits_hz)
+    expected_frequencies_hz = (
+        undamped_frequencies_rad_s(session_order.profile.rig.beam, _MAX_FIT_MODES) / math.tau
+    )
+    return max(1, int(np.count_nonzero(expected_frequencies_hz < highest_fit_frequency_hz)))
 
 
 def gauge_limits(profile: Profile) -> dict[str, float]:

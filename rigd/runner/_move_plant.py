@@ -56,53 +56,54 @@ def loop_model_with(profile: Profile, identified_beam: IdentifiedBeam | None) ->
 
 def move_plant_of(
     profile: Profile,
-    model: LoopModel,
+    loop_model: LoopModel,
     coupling_limit_nm: float,
     identified_beam: IdentifiedBeam | None = None,
 ) -> MovePlant:
     """Return the model of motor, beam and closed loop that is used to plan a move.
 
-    `coupling_limit_nm` is the largest coupling torque that the sensor can measure. `model` contains
-    the beam; `identified_beam` states its uncertainty, or is None for the beam of the profile.
+    `coupling_limit_nm` is the largest coupling torque that the sensor can measure. `loop_model`
+    contains the beam; `identified_beam` states its uncertainty, or is None for the beam of the
+    profile.
     """
     # The friction compensation (tanh of the speed) is not linear, and its maximum is subtracted
     # from the available torque.
-    settings = replace(model.settings, friction_compensation_nm=0.0)
-    uncompensated_loop = close_loop(replace(model, settings=settings))
+    uncompensated_settings = replace(loop_model.settings, friction_compensation_nm=0.0)
+    uncompensated_loop = close_loop(replace(loop_model, settings=uncompensated_settings))
     check_stability(uncompensated_loop)
     locked_hub_poles, closed_loop_poles = mode_poles(uncompensated_loop)
     # Torque of a mode for the angle's acceleration: 2 Re(r exp(p t)), r its residue in G(s)/s².
-    assert model.plant is not None
-    torque_per_angle = 2.0 * np.abs(model.plant.residues(locked_hub_poles))
-    frequency_uncertainty = (_DEFAULT_FREQUENCY_UNCERTAINTY,) * closed_loop_poles.size
+    assert loop_model.plant is not None
+    torque_per_angle = 2.0 * np.abs(loop_model.plant.residues(locked_hub_poles))
+    relative_frequency_uncertainty = (_DEFAULT_FREQUENCY_UNCERTAINTY,) * closed_loop_poles.size
     if identified_beam is not None:
-        frequency_uncertainty = identified_beam.pole_uncertainty(closed_loop_poles.size)
+        relative_frequency_uncertainty = identified_beam.pole_uncertainty(closed_loop_poles.size)
     control_motor, rig = profile.control_motor, profile.rig
     disturbances = Disturbances(
         control_motor.coulomb_nm, rig.encoder.resolution_rad, torque_noise_nm(profile)
     )
-    compensated_loop = replace(uncompensated_loop, model=model)
+    compensated_loop = replace(uncompensated_loop, model=loop_model)
 
-    def respond_disturbed(reference_rad: RealArray, modes: int) -> tuple[RealArray, RealArray]:
+    def respond_disturbed(reference_rad: RealArray, mode_count: int) -> tuple[RealArray, RealArray]:
         disturbed_response = simulate_disturbed(
             compensated_loop,
             reference_rad,
             disturbances,
-            mode_count=modes,
+            mode_count=mode_count,
             draw_count=_NOISE_REALISATIONS,
         )
         return disturbed_response.angle_rad, disturbed_response.mode_torque_nm
 
     return MovePlant(
-        rate_hz=model.rate_hz,
+        rate_hz=loop_model.rate_hz,
         respond=uncompensated_loop.simulate,
         disturbed=respond_disturbed,
         poles_rad_s=closed_loop_poles,
         torque_per_state_nm_s=torque_per_angle
         * np.abs(uncompensated_loop.response(np.abs(closed_loop_poles) / (2.0 * math.pi))),
-        frequency_uncertainty=np.array(frequency_uncertainty),
+        frequency_uncertainty=np.array(relative_frequency_uncertainty),
         torque_noise_nm=disturbances.torque_noise_nm,
-        settling_s=_SETTLING_TIME_CONSTANTS / settings.pole_rad_s,
+        settling_s=_SETTLING_TIME_CONSTANTS / uncompensated_settings.pole_rad_s,
         peak_torque_nm=control_motor.peak_torque_nm,
         friction_nm=profile.control.friction_compensation_nm,
         largest_acceleration_rad_s2=_MAX_REFERENCE_ACCELERATION_RATIO
@@ -128,7 +129,7 @@ def torque_noise_nm(profile: Profile) -> float:
     return float(np.linalg.norm(np.array(rig.sensor.projection) * axis_noise))
 
 
-def mode_poles(loop: ClosedLoop) -> tuple[ComplexArray, ComplexArray]:
+def mode_poles(closed_loop: ClosedLoop) -> tuple[ComplexArray, ComplexArray]:
     """Return the poles of the beam with locked hub, and the closed loop's poles, in rad/s.
 
     The arrays (m,) contain one pole of each conjugate pair, for the lowest modes that oscillate
@@ -136,7 +137,7 @@ def mode_poles(loop: ClosedLoop) -> tuple[ComplexArray, ComplexArray]:
     poles of the closed loop. They are near those of the beam with locked hub, and differ if the
     loop damps a mode.
     """
-    loop_model = loop.model
+    loop_model = closed_loop.model
     assert loop_model.plant is not None
     locked_hub_poles = loop_model.plant.poles(clamped_free_eigenvalues(_MAX_MODES))[:, 0]
     locked_hub_poles = locked_hub_poles[
@@ -144,6 +145,7 @@ def mode_poles(loop: ClosedLoop) -> tuple[ComplexArray, ComplexArray]:
         & (np.abs(locked_hub_poles) < 0.5 * math.pi * loop_model.rate_hz)
     ]
     closed_loop_poles = [
-        loop.poles_rad_s[np.argmin(np.abs(loop.poles_rad_s - s))] for s in locked_hub_poles
+        closed_loop.poles_rad_s[np.argmin(np.abs(closed_loop.poles_rad_s - s))]
+        for s in locked_hub_poles
     ]
     return locked_hub_poles, np.array(closed_loop_poles)

@@ -32,7 +32,7 @@ _FINAL_FIT_TIMEOUT_S: Final = 60.0
 """Maximum time in seconds to wait for the fit of the whole record after the session."""
 _STOPPED_FIT_TIMEOUT_S: Final = 5.0
 """Maximum time in seconds to wait for the fit of the whole record if a stop is requested."""
-_STORED_KEYS: Final = (
+_STORED_FIT_KEYS: Final = (
     "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
     "modes", "parameters",
 )  # fmt: skip
@@ -69,9 +69,11 @@ class FitClient(WorkerClient):
         self._skip_reason = ""
         self.segments: Mapping[str, tuple[int, int]] = {}
         self.unmet_reason = ""
-        first_position = group.channels.samples.written_count
+        first_sample_position = group.channels.samples.written_count
         self._start(
-            FitJob(group.channels.specs, first_position, profile, reference, search, realtime)
+            FitJob(
+                group.channels.specs, first_sample_position, profile, reference, search, realtime
+            )
         )
 
     def begin(self, header: FileHeader) -> None:
@@ -84,12 +86,13 @@ class FitClient(WorkerClient):
         estimates, self._new_estimates = self._new_estimates, []
         return estimates
 
-    def finish(self, ticks: int, call_while_waiting: Callable[[], None]) -> dict[str, Any]:
+    def finish(self, record_ticks: int, call_while_waiting: Callable[[], None]) -> dict[str, Any]:
         """Wait for the fit of the whole record; return the last estimate as a JSON dictionary.
 
-        `ticks` is the length of the record. `call_while_waiting` is called repeatedly meanwhile.
+        `record_ticks` is the length of the record. `call_while_waiting` is called repeatedly
+        meanwhile.
         """
-        self._send(RecordEnded(ticks))
+        self._send(RecordEnded(record_ticks))
         stop_deadline_s = time.monotonic() + _STOPPED_FIT_TIMEOUT_S
 
         def is_worth_waiting() -> bool:
@@ -107,15 +110,15 @@ class FitClient(WorkerClient):
         ):
             self._give_up("The fit of the whole record took too long.")
         last_estimate = {} if self._last_report is None else self._last_report.document
-        fit_document = {key: last_estimate[key] for key in _STORED_KEYS if key in last_estimate}
+        fit_document = {key: last_estimate[key] for key in _STORED_FIT_KEYS if key in last_estimate}
         if self._search is not None:
-            targets = self._search.targets
+            precision_targets = self._search.targets
             target_results = (
-                target_estimates(fit_document, targets) if "modes" in fit_document else []
+                target_estimates(fit_document, precision_targets) if "modes" in fit_document else []
             )
             is_precision_reached, self.unmet_reason = self._assess_precision(target_results)
             fit_document["search"] = {
-                "asked": [str(target) for target in targets],
+                "asked": [str(target) for target in precision_targets],
                 "targets": targets_json(target_results),
                 "reached": is_precision_reached,
                 "reason": self.unmet_reason or self._success_sentence,
@@ -149,22 +152,26 @@ class FitClient(WorkerClient):
         elif not unknown_reason and not estimates:
             unknown_reason = "Its fit has no modes."
         if unknown_reason:
-            search_text = "Reached during the session." if was_reached_before else self._end_reason
-            sentences = ["" if search_text == unknown_reason else search_text]
+            search_end_text = (
+                "Reached during the session." if was_reached_before else self._end_reason
+            )
+            sentences = ["" if search_end_text == unknown_reason else search_end_text]
             sentences.append(
                 f"Not known whether the whole record has the precision: {unknown_reason}"
             )
             sentences.append(f"Last estimate: {estimates_text(estimates)}." if estimates else "")
             return None, " ".join(filter(None, sentences))
         imprecise_estimates = [
-            target_estimate for target_estimate in estimates if not target_estimate.ratio <= 1.0
+            target_estimate for target_estimate in estimates if not target_estimate.std_ratio <= 1.0
         ]
         if not imprecise_estimates:
             return True, ""
-        unmet_text = self._end_reason
+        unmet_reason = self._end_reason
         if was_reached_before:
-            unmet_text = self.failure or "Reached during the session, but not by the whole record."
-        return False, f"{unmet_text} So far: {estimates_text(imprecise_estimates)}.".strip()
+            unmet_reason = (
+                self.failure or "Reached during the session, but not by the whole record."
+            )
+        return False, f"{unmet_reason} So far: {estimates_text(imprecise_estimates)}.".strip()
 
     @property
     def search_failure(self) -> str:

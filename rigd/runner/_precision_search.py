@@ -28,7 +28,7 @@ from rigd.units import with_half_width, with_percentage
 
 RealArray = NDArray[np.float64]
 
-_SUFFICIENT_RATIO: Final = 0.98
+_SUFFICIENT_STD_RATIO: Final = 0.98
 """Maximum ratio of expected to requested standard deviation at which a pause is appended."""
 _MIN_FORECAST_ESTIMATES: Final = 4
 """Minimum number of estimates from which the remaining time is forecast."""
@@ -39,7 +39,7 @@ _MAX_FORECAST_S: Final = 86_400.0
 more than a day."""
 _MAX_UNREACHABLE_FORECASTS: Final = 3
 """Number of consecutive forecasts of an unreachable precision that end the session."""
-_NOT_VISIBLE: Final = "not visible yet"
+_NOT_VISIBLE_TEXT: Final = "not visible yet"
 """Doubt of an estimate whose mode the record does not show."""
 _MAX_DOUBTFUL_FITS: Final = 4
 """Number of consecutive doubtful fits of all damping structures that end the session."""
@@ -47,18 +47,18 @@ _COLUMN_WIDTH: Final = 22
 """Width in characters of a column of the printed table."""
 _MAX_REPEATED_SCANS: Final = 2
 """Maximum number of times that the scan is repeated after failed fits."""
-_TIGHTENING_FACTOR: Final = 0.7
+_TARGET_TIGHTENING_FACTOR: Final = 0.7
 """Factor by which requested standard deviations are reduced after a flagged estimate: half the
 variance requires twice the information."""
-_TIP_SLOPE_MARGIN: Final = 0.85
+_TIP_SLOPE_FRACTION: Final = 0.85
 """Fraction of the largest tip slope for which segments are designed. While the damping is not known
 precisely, the predicted slope is up to 24 % smaller than the slope of the segment."""
-_REDUCED_AMPLITUDE: Final = 2**0.5 - 1
+_REDUCED_AMPLITUDE_FRACTION: Final = 2**0.5 - 1
 """Amplitude of most segments, relative to the largest one, while air drag of unknown size damps the
 beam. The effect of the damping on the torque is proportional to the amplitude, that of drag to its
 square: this amplitude together with the largest one distinguishes them best (G. Elfving, Optimum
 allocation in linear regression theory, Ann. Math. Stat. 23, 1952)."""
-_FULL_AMPLITUDE_PERIOD: Final = 4
+_SEGMENTS_PER_FULL_AMPLITUDE: Final = 4
 """While air drag is unknown, one of this number of segments has the largest amplitude; the optimum
 would be 29 % of the time."""
 _CORRECTION_FACTOR_RANGE: Final = (0.5, 16.0)
@@ -96,31 +96,33 @@ class TargetEstimate:
         return f"{self.quantity} of {'any mode' if self.mode is None else f'mode {self.mode}'}"
 
     @property
-    def ratio(self) -> float:
+    def std_ratio(self) -> float:
         """Ratio of the estimate's standard deviation to the requested one; at most 1 suffices."""
         return self.std / self.target_std if self.target_std > 0.0 else inf
 
 
 def target_estimates(
-    document: Mapping[str, Any], targets: Sequence[Target]
+    fit_document: Mapping[str, Any], targets: Sequence[Target]
 ) -> list[TargetEstimate]:
     """Return the estimates of all requested quantities from a document of the estimator.
 
     docs/online_fit.md describes the document. A modal target without a mode number applies to each
     mode in the excited frequency band.
     """
-    return [estimate for target in targets for estimate in _estimates_of(document, target)]
+    return [estimate for target in targets for estimate in _estimates_of(fit_document, target)]
 
 
-def _estimates_of(document: Mapping[str, Any], target: Target) -> Iterator[TargetEstimate]:
+def _estimates_of(fit_document: Mapping[str, Any], target: Target) -> Iterator[TargetEstimate]:
     """Yield the estimates of one requested quantity, one for each mode to which it applies."""
     quantity_key = _MODAL_QUANTITY_KEYS.get(target.quantity)
     if quantity_key is None:
-        parameters = document.get("parameters", {})
+        parameters = fit_document.get("parameters", {})
         yield _target_estimate(target, Estimate.from_json(parameters.get(target.quantity)))
         return
     # The fit also reports modes above the band, which no segment excites.
-    modes_in_band = [m for m in document["modes"] if (m["frequency_hz"]["value"] or 0.0) < BAND_HZ]
+    modes_in_band = [
+        m for m in fit_document["modes"] if (m["frequency_hz"]["value"] or 0.0) < BAND_HZ
+    ]
     matching_modes = [m for m in modes_in_band if target.mode in (None, m["mode"])]
     for mode_document in matching_modes:
         target_estimate = _target_estimate(
@@ -130,7 +132,7 @@ def _estimates_of(document: Mapping[str, Any], target: Target) -> Iterator[Targe
         yield (
             target_estimate
             if mode_document["shown"]
-            else replace(target_estimate, std=inf, doubt=_NOT_VISIBLE)
+            else replace(target_estimate, std=inf, doubt=_NOT_VISIBLE_TEXT)
         )
     if not matching_modes:
         missing_reason = "no such mode was found in the band"
@@ -156,22 +158,22 @@ def _target_estimate(target: Target, estimate: Estimate | None) -> TargetEstimat
 
 
 def beam_estimate(
-    document: Mapping[str, Any], targets: Sequence[Target], uniformity: float
+    fit_document: Mapping[str, Any], targets: Sequence[Target], uniformity: float
 ) -> BeamEstimate:
     """Return the beam estimate, for the design of excitation, from the estimator's document.
 
     `uniformity` is the relative standard deviation of each mode's frequency from the frequency of a
     uniform beam. If all targets are modal, the parameters are those of the modal model.
     """
-    parameter_names, noise_document = document["covariance"]["names"], document["noise"]
+    parameter_names, noise_document = fit_document["covariance"]["names"], fit_document["noise"]
     estimated_beam = BeamEstimate.from_dict(
-        {**document["plant"], "names": parameter_names, "noise": noise_document}
+        {**fit_document["plant"], "names": parameter_names, "noise": noise_document}
     )
     if uniformity and all(target.quantity in _MODAL_QUANTITY_KEYS for target in targets):
         return estimated_beam.modal()
     # The tolerance is wider if the modes deviate by more than the stated uniformity.
     return estimated_beam.with_tolerance(
-        max(uniformity, (document["uniformity_percent"] or 0.0) / 100.0)
+        max(uniformity, (fit_document["uniformity_percent"] or 0.0) / 100.0)
     )
 
 
@@ -187,13 +189,13 @@ class _PlannedInterval:
 
     name: str
     reference_rad: RealArray
-    reference_tick: int
+    first_reference_tick: int
     """First tick of the segment in the reference."""
-    record_tick: int
+    first_record_tick: int
     """First tick of the segment in the record."""
 
     @property
-    def size(self) -> int:
+    def tick_count(self) -> int:
         """Number of ticks of the segment."""
         return int(self.reference_rad.size)
 
@@ -210,16 +212,16 @@ class ExcitationPlanner:
         self,
         search: PrecisionSearch,
         profile: Profile,
-        writer: ReferenceWriter,
+        reference_writer: ReferenceWriter,
         *,
-        start_rad: float = 0.0,
+        start_angle_rad: float = 0.0,
     ) -> None:
         self._targets = search.targets
         self._tip_slope_rad = search.tip_slope_rad
-        self._preview = RigPreview(profile, start_rad)
-        self._writer = writer
+        self._preview = RigPreview(profile, start_angle_rad)
+        self._writer = reference_writer
         self._rate_hz = profile.rig.rate_hz
-        self._max_ticks = writer.ticks + writer.room
+        self._max_ticks = reference_writer.ticks + reference_writer.room
         scan_tick, scan_rad = search.scan
         self._intervals = [_PlannedInterval("scan", scan_rad, scan_tick, scan_tick)]
         self._segment_count = self._repeated_scans = self._shown_tick = 0
@@ -228,15 +230,19 @@ class ExcitationPlanner:
         self._tightening = 1.0
         self._forecast = _TimeForecast()
         self._correction_factors: dict[str, float] = {}
-        stated_percent = search.uniformity_percent
-        profile_percent = profile.uncertainty.uniformity_percent
-        self._uniformity = (profile_percent if stated_percent is None else stated_percent) / 100.0
+        stated_uniformity_percent = search.uniformity_percent
+        profile_uniformity_percent = profile.uncertainty.uniformity_percent
+        self._uniformity = (
+            profile_uniformity_percent
+            if stated_uniformity_percent is None
+            else stated_uniformity_percent
+        ) / 100.0
         self._column_names: list[str] = []
         self.due_tick: int | None = scan_tick + scan_rad.size
         self.may_be_last = False
 
-    def plan_next(
-        self, document: Mapping[str, Any], held_ticks: int, held_ticks_before: int
+    def plan_next_segment(
+        self, fit_document: Mapping[str, Any], held_ticks: int, held_ticks_before: int
     ) -> Iterator[object]:
         """Plan the next segment from a fit of the samples before `due_tick`.
 
@@ -245,57 +251,65 @@ class ExcitationPlanner:
         the start of the segment that began last.
         """
         last_interval = self._intervals[-1]
-        last_interval.record_tick = last_interval.reference_tick + held_ticks_before
+        last_interval.first_record_tick = last_interval.first_reference_tick + held_ticks_before
         self._has_full_fit |= self.may_be_last
-        if document["problem"] or "plant" not in document:
-            problem_text = document["problem"] or "Nothing could be fitted."
+        if fit_document["problem"] or "plant" not in fit_document:
+            problem_text = fit_document["problem"] or "Nothing could be fitted."
             if self._column_names:
                 # Earlier fits succeeded: the record now has a gap, or the sensor is stuck.
-                yield self._end_message(f"Given up: {problem_text}", reached=False)
+                yield self._search_end_message(f"Given up: {problem_text}", is_reached=False)
             else:
                 yield from self._repeat_scan(problem_text, held_ticks)
             return
-        estimates = target_estimates(document, self._targets)
-        time_s = document["tick"] / self._rate_hz
-        self._forecast.add(time_s, max(target_estimate.ratio for target_estimate in estimates))
-        doubt_text = document["doubt"] or ""
+        estimates = target_estimates(fit_document, self._targets)
+        record_time_s = fit_document["tick"] / self._rate_hz
+        self._forecast.add(
+            record_time_s, max(target_estimate.std_ratio for target_estimate in estimates)
+        )
+        doubt_text = fit_document["doubt"] or ""
         # A doubt from the structure with most parameters is first checked with all structures.
-        is_shown = document["tick"] == self._shown_tick
-        hides_row = is_shown or (bool(doubt_text) and not self.may_be_last)
-        yield self._report_message(document, estimates, time_s, without_table_row=hides_row)
+        is_tick_shown = fit_document["tick"] == self._shown_tick
+        hides_row = is_tick_shown or (bool(doubt_text) and not self.may_be_last)
+        yield self._report_message(
+            fit_document, estimates, record_time_s, without_table_row=hides_row
+        )
         if not hides_row:
-            self._shown_tick = document["tick"]
-        if self.may_be_last and all(target_estimate.ratio <= 1.0 for target_estimate in estimates):
-            yield self._end_message(f"Reached: {estimates_text(estimates)}.", reached=True)
+            self._shown_tick = fit_document["tick"]
+        if self.may_be_last and all(
+            target_estimate.std_ratio <= 1.0 for target_estimate in estimates
+        ):
+            yield self._search_end_message(
+                f"Reached: {estimates_text(estimates)}.", is_reached=True
+            )
             return
         if self.may_be_last:
             flagged_estimates = [
                 target_estimate
                 for target_estimate in estimates
-                if target_estimate.doubt not in ("", _NOT_VISIBLE)
+                if target_estimate.doubt not in ("", _NOT_VISIBLE_TEXT)
             ]
             if flagged_estimates and last_interval.name == "pause" and not doubt_text:
                 # The plan is fulfilled, but the estimate is flagged as no property of the antenna.
                 doubt_text = f"{flagged_estimates[0].name}: {flagged_estimates[0].doubt}"
-                self._tightening *= _TIGHTENING_FACTOR
+                self._tightening *= _TARGET_TIGHTENING_FACTOR
             self._doubtful_count = self._doubtful_count + 1 if doubt_text else 0
         if self._doubtful_count >= _MAX_DOUBTFUL_FITS:
-            findings_text = " ".join(document["findings"])
+            findings_text = " ".join(fit_document["findings"])
             end_reason = (
                 f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: "
                 "rigd run chirp."
             )
-            yield self._end_message(end_reason.replace("  ", " "), reached=False)
+            yield self._search_end_message(end_reason.replace("  ", " "), is_reached=False)
             return
         try:
-            estimate = beam_estimate(document, self._targets, self._uniformity)
+            estimate = beam_estimate(fit_document, self._targets, self._uniformity)
             yield from self._plan_segment_or_pause(
                 estimate,
-                document["tick"],
+                fit_document["tick"],
                 estimates,
                 held_ticks,
                 doubt_text,
-                self._next_amplitude(with_air_drag=document["with_air_drag"]),
+                self._next_amplitude_fraction(with_air_drag=fit_document["with_air_drag"]),
             )
         except (RigdError, ArithmeticError, ValueError) as error:
             # The estimate is too inaccurate for planning.
@@ -319,19 +333,22 @@ class ExcitationPlanner:
         `begun_segment_end` is the tick of the reference at which the segment that began last
         ends, or 0 if none has begun.
         """
-        return len(self._intervals) == 1 or begun_segment_end > self._intervals[-1].reference_tick
+        return (
+            len(self._intervals) == 1
+            or begun_segment_end > self._intervals[-1].first_reference_tick
+        )
 
-    def end_of_record(
-        self, ticks: int, held_ticks_before: int, begun_segment_end: int
+    def record_end_message(
+        self, record_ticks: int, held_ticks_before: int, begun_segment_end: int
     ) -> SearchEnded:
-        """Return the message that ends the search because the record ended after `ticks` ticks."""
+        """Return the message that ends the search because the record has ended."""
         if self.has_last_segment_begun(begun_segment_end):
             last_interval = self._intervals[-1]
-            last_interval.record_tick = last_interval.reference_tick + held_ticks_before
+            last_interval.first_record_tick = last_interval.first_reference_tick + held_ticks_before
         else:
             self._intervals.pop()
-        return self._end_message(
-            self._too_long_text if ticks >= self._max_ticks else "", reached=False
+        return self._search_end_message(
+            self._too_long_text if record_ticks >= self._max_ticks else "", is_reached=False
         )
 
     @property
@@ -346,7 +363,7 @@ class ExcitationPlanner:
         estimates: Sequence[TargetEstimate],
         held_ticks: int,
         doubt_text: str,
-        amplitude: float,
+        amplitude_fraction: float,
     ) -> Iterator[object]:
         """Append the next segment, or a pause if the planned segments are expected to suffice."""
         reference_rad = self._reference_rad(held_ticks)
@@ -355,7 +372,7 @@ class ExcitationPlanner:
         remaining_s = remaining_ticks / self._rate_hz
         if remaining_s < SHORTEST_S + PAUSE_S:
             if self.may_be_last or remaining_ticks <= 0:
-                yield self._end_message(self._too_long_text, reached=False)
+                yield self._search_end_message(self._too_long_text, is_reached=False)
             else:
                 self._append_pause(min(PAUSE_S, remaining_s))
             return
@@ -367,12 +384,12 @@ class ExcitationPlanner:
             self._corrected_targets(estimate, angle_rad[:record_tick], estimates),
             self._preview,
             remaining_s - PAUSE_S,
-            tip_slope_rad=_TIP_SLOPE_MARGIN * self._tip_slope_rad,
+            tip_slope_rad=_TIP_SLOPE_FRACTION * self._tip_slope_rad,
             through=self._modes_to_excite(estimates),
-            limit_fraction=amplitude,
+            limit_fraction=amplitude_fraction,
         )
         if not self.may_be_last and all(
-            target_forecast.ratio <= _SUFFICIENT_RATIO
+            target_forecast.ratio <= _SUFFICIENT_STD_RATIO
             for target_forecast in next_planned_segment.now
         ):
             self._append_pause(PAUSE_S)
@@ -390,24 +407,26 @@ class ExcitationPlanner:
             else is_too_slow and self._forecast.unreachable_reason(remaining_s)
         )
         # A segment of reduced amplitude does not show what is out of reach.
-        if amplitude == 1.0 or not unreachable_reason:
+        if amplitude_fraction == 1.0 or not unreachable_reason:
             self._unreachable_count = self._unreachable_count + 1 if unreachable_reason else 0
         if self._unreachable_count >= _MAX_UNREACHABLE_FORECASTS:
-            yield self._end_message(f"Out of reach: {unreachable_reason}", reached=False)
+            yield self._search_end_message(f"Out of reach: {unreachable_reason}", is_reached=False)
             return
         self._segment_count += 1
-        self._append(f"piece_{self._segment_count}", next_planned_segment.reference_rad)
-        self.due_tick = self._intervals[-1].reference_tick
+        self._append_segment(f"piece_{self._segment_count}", next_planned_segment.reference_rad)
+        self.due_tick = self._intervals[-1].first_reference_tick
         # Another structure, such as a compliant clamp, may fit where a uniform beam does not.
         self.may_be_last = bool(doubt_text) and not self.may_be_last
         yield PlannedSegment(
             next_planned_segment.name, self._expectation_document(next_planned_segment, estimates)
         )
 
-    def _next_amplitude(self, *, with_air_drag: bool) -> float:
+    def _next_amplitude_fraction(self, *, with_air_drag: bool) -> float:
         """Return the amplitude of the next segment, relative to the largest one."""
-        has_full_amplitude = not with_air_drag or self._segment_count % _FULL_AMPLITUDE_PERIOD == 0
-        return 1.0 if has_full_amplitude else _REDUCED_AMPLITUDE
+        has_full_amplitude = (
+            not with_air_drag or self._segment_count % _SEGMENTS_PER_FULL_AMPLITUDE == 0
+        )
+        return 1.0 if has_full_amplitude else _REDUCED_AMPLITUDE_FRACTION
 
     def _corrected_targets(
         self, estimate: BeamEstimate, angle_rad: RealArray, estimates: Sequence[TargetEstimate]
@@ -450,7 +469,7 @@ class ExcitationPlanner:
         unseen_modes = [
             target_estimate.mode
             for target_estimate in estimates
-            if target_estimate.doubt == _NOT_VISIBLE and target_estimate.mode
+            if target_estimate.doubt == _NOT_VISIBLE_TEXT and target_estimate.mode
         ]
         self._excites_unseen_modes = (
             bool(unseen_modes) and self._segment_count > 0 and not self._excites_unseen_modes
@@ -465,49 +484,51 @@ class ExcitationPlanner:
         if self._repeated_scans >= _MAX_REPEATED_SCANS or not self._append_scan(
             f"scan_{self._repeated_scans + 2}", held_ticks
         ):
-            yield self._end_message(f"Given up: {reason}", reached=False)
+            yield self._search_end_message(f"Given up: {reason}", is_reached=False)
             return
         self._repeated_scans += 1
         self.may_be_last = False
         yield PlannedSegment("the scan once more", {"why": reason})
 
-    def _append_scan(self, name: str, held_ticks: int) -> bool:
-        """Append the first chirp again as segment `name`; return False if too little time remains.
+    def _append_scan(self, segment_name: str, held_ticks: int) -> bool:
+        """Append the first chirp again as a segment; return False if too little time remains.
 
         The motor has been held for `held_ticks` so far, which the record contains in addition.
         """
         scan_rad = self._intervals[0].reference_rad
         if self._max_ticks - self._writer.ticks - held_ticks < scan_rad.size:
             return False
-        self._append(name, scan_rad)
+        self._append_segment(segment_name, scan_rad)
         self.due_tick = self._writer.ticks
         return True
 
     def _append_pause(self, duration_s: float) -> None:
         """Append a pause, after which all damping structures are fitted to the whole record."""
-        self._append("pause", np.zeros(round(duration_s * self._rate_hz)))
+        self._append_segment("pause", np.zeros(round(duration_s * self._rate_hz)))
         self.due_tick, self.may_be_last = self._writer.ticks, True
 
-    def _append(self, name: str, reference_rad: RealArray) -> None:
+    def _append_segment(self, segment_name: str, reference_rad: RealArray) -> None:
         """Append a named segment to the reference that the control loop reads."""
         first_tick = self._writer.ticks
-        self._intervals.append(_PlannedInterval(name, reference_rad, first_tick, first_tick))
+        self._intervals.append(
+            _PlannedInterval(segment_name, reference_rad, first_tick, first_tick)
+        )
         self._writer.append(reference_rad)
 
     def _reference_rad(self, held_ticks: int) -> RealArray:
         """Return the reference angle (n,) at each tick of the record up to the last segment."""
         reference_rad = np.zeros(self._writer.ticks + held_ticks)
         for interval in self._intervals:
-            reference_rad[interval.record_tick : interval.record_tick + interval.size] = (
-                interval.reference_rad
-            )
+            reference_rad[
+                interval.first_record_tick : interval.first_record_tick + interval.tick_count
+            ] = interval.reference_rad
         return reference_rad
 
     def _report_message(
         self,
-        document: Mapping[str, Any],
+        fit_document: Mapping[str, Any],
         estimates: Sequence[TargetEstimate],
-        time_s: float,
+        record_time_s: float,
         *,
         without_table_row: bool,
     ) -> FitReport:
@@ -516,12 +537,14 @@ class ExcitationPlanner:
         The row is left out if `without_table_row` is True.
         """
         search_document = {"left_s": self._forecast.remaining_s, "targets": targets_json(estimates)}
-        validity = Validity.from_document(document.get("validity"))
-        table_rows = [] if without_table_row else self._table_rows(estimates, time_s, validity)
-        return FitReport({**document, "search": search_document, "text": table_rows})
+        validity = Validity.from_document(fit_document.get("validity"))
+        table_rows = (
+            [] if without_table_row else self._table_rows(estimates, record_time_s, validity)
+        )
+        return FitReport({**fit_document, "search": search_document, "text": table_rows})
 
     def _table_rows(
-        self, estimates: Sequence[TargetEstimate], time_s: float, validity: Validity
+        self, estimates: Sequence[TargetEstimate], record_time_s: float, validity: Validity
     ) -> list[str]:
         """Return the next row of the printed table, after a heading if its columns changed."""
         table_rows = []
@@ -539,12 +562,13 @@ class ExcitationPlanner:
         )
         return [
             *table_rows,
-            f"{time_s:5.1f} s {row_text}{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
+            f"{record_time_s:5.1f} s {row_text}"
+            f"{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
         ]
 
-    def targets_document(self, document: Mapping[str, Any]) -> dict[str, Any]:
+    def targets_document(self, fit_document: Mapping[str, Any]) -> dict[str, Any]:
         """Return the estimates of all requested quantities as a dictionary for JSON."""
-        return {"targets": targets_json(target_estimates(document, self._targets))}
+        return {"targets": targets_json(target_estimates(fit_document, self._targets))}
 
     def _expectation_document(
         self, segment: Segment, estimates: Sequence[TargetEstimate]
@@ -573,16 +597,19 @@ class ExcitationPlanner:
             "left_s": self._forecast.remaining_s,
         }
 
-    def _end_message(self, reason: str, *, reached: bool) -> SearchEnded:
+    def _search_end_message(self, reason: str, *, is_reached: bool) -> SearchEnded:
         """Return the message that ends the search, with the ticks of all segments."""
         self.due_tick = None
         segment_ticks = {
-            interval.name: (interval.record_tick, interval.record_tick + interval.size)
+            interval.name: (
+                interval.first_record_tick,
+                interval.first_record_tick + interval.tick_count,
+            )
             for interval in self._intervals
             if interval.name != "pause"
         }
-        segment_ticks["sweep"] = (self._intervals[0].record_tick, self._max_ticks)
-        return SearchEnded(reached, reason, segment_ticks)
+        segment_ticks["sweep"] = (self._intervals[0].first_record_tick, self._max_ticks)
+        return SearchEnded(is_reached, reason, segment_ticks)
 
 
 class _TimeForecast:
@@ -596,10 +623,10 @@ class _TimeForecast:
     def __init__(self) -> None:
         self._information_at_times: list[tuple[float, float]] = []
 
-    def add(self, time_s: float, ratio: float) -> None:
+    def add(self, record_time_s: float, std_ratio: float) -> None:
         """Add the ratio of reported to requested standard deviation at a time of the record."""
-        if isfinite(ratio):
-            self._information_at_times.append((time_s, ratio**-2))
+        if isfinite(std_ratio):
+            self._information_at_times.append((record_time_s, std_ratio**-2))
 
     @property
     def remaining_s(self) -> float | None:
@@ -641,25 +668,29 @@ class _TimeForecast:
             present_information + (1.0 - present_information) * available_s / required_s
         ) ** -0.5
         if required_s > _MAX_FORECAST_S:
-            time_text, longer_text = "more than a day", ""
+            required_time_text, longer_record_text = "more than a day", ""
         else:
-            time_text = f"about {required_s:.0f} s more"
-            longer_text = f", or give --at-most {1.2 * (now_s + required_s):.0f}"
+            required_time_text = f"about {required_s:.0f} s more"
+            longer_record_text = f", or give --at-most {1.2 * (now_s + required_s):.0f}"
         return (
-            f"it would take {time_text}, and the remaining {available_s:.0f} s suffice for "
+            f"it would take {required_time_text}, and the remaining {available_s:.0f} s suffice "
+            "for "
             f"{reachable_ratio:.2g} times the requested standard deviation. Request that"
-            f"{longer_text}."
+            f"{longer_record_text}."
         )
 
 
-def _cell_text(estimate: TargetEstimate) -> str:
+def _cell_text(target_estimate: TargetEstimate) -> str:
     """Return the text of a table cell with an estimate; damping ratios are in percent."""
-    if estimate.value is None or estimate.doubt:
-        return estimate.doubt if estimate.doubt == _NOT_VISIBLE else "doubtful"
-    display_scale, unit_text = (100.0, " %") if estimate.name.startswith("damping") else (1.0, "")
-    scaled_std = display_scale * estimate.std
+    if target_estimate.value is None or target_estimate.doubt:
+        return target_estimate.doubt if target_estimate.doubt == _NOT_VISIBLE_TEXT else "doubtful"
+    display_scale, unit_text = (
+        (100.0, " %") if target_estimate.name.startswith("damping") else (1.0, "")
+    )
+    scaled_std = display_scale * target_estimate.std
     return (
-        f"{with_half_width(display_scale * estimate.value, (-scaled_std, scaled_std))}{unit_text}"
+        f"{with_half_width(display_scale * target_estimate.value, (-scaled_std, scaled_std))}"
+        f"{unit_text}"
     )
 
 
@@ -684,11 +715,11 @@ def estimates_text(estimates: Sequence[TargetEstimate]) -> str:
     return ", ".join(_estimate_text(estimate) for estimate in estimates)
 
 
-def _estimate_text(estimate: TargetEstimate) -> str:
+def _estimate_text(target_estimate: TargetEstimate) -> str:
     """Return text with one estimate and its standard deviation, or why it is doubtful."""
-    if estimate.value is None or estimate.doubt:
-        return f"{estimate.name}: {estimate.doubt}"
+    if target_estimate.value is None or target_estimate.doubt:
+        return f"{target_estimate.name}: {target_estimate.doubt}"
     return (
-        f"{estimate.name} {estimate.value:.5g}, standard deviation "
-        f"{with_percentage(estimate.std, estimate.value)}"
+        f"{target_estimate.name} {target_estimate.value:.5g}, standard deviation "
+        f"{with_percentage(target_estimate.std, target_estimate.value)}"
     )

@@ -46,7 +46,7 @@ class ProbeResult:
     estimate: ProbeEstimate
     """Estimated friction, and ratios of measured to expected values."""
 
-    def contradiction(self, profile: Profile, *, checks_motor: bool = True) -> str:
+    def contradiction_text(self, profile: Profile, *, checks_motor: bool = True) -> str:
         """Return text that states how the result contradicts the profile, or "" if it does not.
 
         If `checks_motor` is False, torque and inertia of the motor are not compared.
@@ -62,7 +62,7 @@ class ProbeResult:
             if estimate_values[key] is not None
         }
 
-    def lines(self, profile: Profile) -> list[str]:
+    def text_lines(self, profile: Profile) -> list[str]:
         """Return lines of text that report the probing move's result to the operator."""
         estimate = self.estimate
         ratio_rows = (
@@ -80,9 +80,10 @@ class ProbeResult:
             for ratio_title, measured_ratio, std in ratio_rows
         ]
         if estimate.coulomb_nm is not None:
-            stated_nm = profile.rig.motor.coulomb_nm
+            stated_friction_nm = profile.rig.motor.coulomb_nm
             report_lines.append(
-                f"Coulomb friction: {estimate.coulomb_nm:.3f} N·m (motor.coulomb_nm: {stated_nm:g})"
+                f"Coulomb friction: {estimate.coulomb_nm:.3f} N·m (motor.coulomb_nm: "
+                f"{stated_friction_nm:g})"
             )
         travel_text = f"{estimate.travel_rad:.2g} rad, {estimate.speed_rad_s:.2g} rad/s"
         return [*report_lines, f"travel and speed, as measured: {travel_text}"]
@@ -102,22 +103,22 @@ def verify_by_probing(
     result is used instead of a new move. Raises ProbeFailedError if the result contradicts the
     profile. If `checks_motor` is False, torque and inertia of the motor are not compared.
     """
-    if _is_measured(profile) or _is_simulated_with_profile(profile):
+    if _are_scales_measured(profile) or _is_simulated_with_profile(profile):
         return None
     probe_result = read_stored_result(profile, rig)
-    if probe_result is None or probe_result.contradiction(profile, checks_motor=checks_motor):
+    if probe_result is None or probe_result.contradiction_text(profile, checks_motor=checks_motor):
         report("info", probing_announcement(profile))
         probe_result = run_probing_move(profile, rig, stop)
-        contradiction_text = probe_result.contradiction(profile, checks_motor=checks_motor)
+        contradiction_text = probe_result.contradiction_text(profile, checks_motor=checks_motor)
         if contradiction_text:
             raise ProbeFailedError(contradiction_text)
-        report("info", f"Probing move passed: {'; '.join(probe_result.lines(profile))}.")
+        report("info", f"Probing move passed: {'; '.join(probe_result.text_lines(profile))}.")
     for warning_text in doubts(probe_result.estimate):
         report("warning", warning_text)
     return probe_result
 
 
-def _is_measured(profile: Profile) -> bool:
+def _are_scales_measured(profile: Profile) -> bool:
     """Return whether a profile states that motor and encoder were measured."""
     return all(profile.sources.get(key) == "measured" for key in PROBED_KEYS)
 

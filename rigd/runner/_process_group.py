@@ -152,8 +152,8 @@ class ProcessGroup:
         is_faster_than_observers = uses_virtual_clock and (
             self.with_live_view or self._extra_processes or may_be_observed
         )
-        buffered_s = VIRTUAL_CLOCK_BUFFER_S if is_faster_than_observers else RECORDER_BUFFER_S
-        self._channels = create_channels(rate_hz, self._fds, buffered_s)
+        ring_buffer_s = VIRTUAL_CLOCK_BUFFER_S if is_faster_than_observers else RECORDER_BUFFER_S
+        self._channels = create_channels(rate_hz, self._fds, ring_buffer_s)
 
     def _start(self, process: Worker) -> None:
         """Start a process, which waits for its job."""

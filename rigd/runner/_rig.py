@@ -169,8 +169,10 @@ class Rig:
                 uses_virtual_clock=self._uses_virtual_clock,
                 may_be_observed=may_be_observed,
             )
-            job = ControlJob(self._profile, target, group.channels.specs, self._uses_virtual_clock)
-            group.idle_process(CONTROL).start(job)
+            control_job = ControlJob(
+                self._profile, target, group.channels.specs, self._uses_virtual_clock
+            )
+            group.idle_process(CONTROL).start(control_job)
             connection = self._await_message(_CONNECT_TIMEOUT_S)
             assert isinstance(connection, DevicesConnected)
             self._connection = replace(
@@ -190,7 +192,7 @@ class Rig:
 
     def run(
         self,
-        order: SessionOrder,
+        session_order: SessionOrder,
         stop: StopRequest,
         on_progress: ProgressCallback,
         can_receive_stop: Callable[[], bool] = can_always_receive_stop,
@@ -199,7 +201,7 @@ class Rig:
 
         Parameters
         ----------
-        order
+        session_order
             Session to run.
         stop
             Stop request of the operator, which ends the session.
@@ -225,7 +227,7 @@ class Rig:
         _reset_session_fields(group.channels.shared_state)
         group.channels.discard_records()
         session_run = SessionSupervisor(
-            order, group, self._connection, self._view, on_progress, can_receive_stop
+            session_order, group, self._connection, self._view, on_progress, can_receive_stop
         )
         end_outcome = end_reason = ""
         try:
@@ -245,12 +247,12 @@ class Rig:
             # and a long series would take 4 kB more for each session.
             gc.collect()
 
-    def show(self, order: SessionOrder, stop: StopRequest) -> str:
+    def show_session(self, session_order: SessionOrder, stop: StopRequest) -> str:
         """Prepare the live view for the next session, and return its address.
 
         Parameters
         ----------
-        order, stop
+        session_order, stop
             As for :meth:`run`.
 
         Returns
@@ -262,7 +264,7 @@ class Rig:
         if self._view is None:
             return "No live view was requested."
         _reset_session_fields(group.channels.shared_state)
-        return self._view.show(order, stop)
+        return self._view.show_session(session_order, stop)
 
     def tare(self) -> dict[str, Any]:
         """Tare the force-torque sensor: average its readings at rest.
@@ -375,7 +377,7 @@ class Rig:
                     f"{WITHOUT_HEARTBEAT_TEXT} Check CPU load."
                 )
 
-    def watch(self) -> None:
+    def check_control_process(self) -> None:
         """Check that the control process is running; call this often while no session runs.
 
         Raises

@@ -17,7 +17,12 @@ from rigd.runner._rig import Rig, RigError
 from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RefusedError, plan_document, plan_session, predicted_metadata
 from rigd.runner.quick_looks import QuickLookQueue
-from rigd.runner.request import SessionOrder, check_required, choose_path, require_disk_space
+from rigd.runner.request import (
+    SessionOrder,
+    choose_session_path,
+    require_disk_space,
+    require_metadata,
+)
 from rigd.runner.session import SessionProgress, SessionResult, can_always_receive_stop
 from rigd.runtime import StopRequest
 
@@ -30,13 +35,13 @@ _POLL_S: Final = 0.05
 class SeriesListener(Protocol):
     """Receiver of the progress of a series of sessions."""
 
-    def on_start(self, number: int, path: Path) -> None:
+    def on_start(self, session_number: int, session_path: Path) -> None:
         """Process the start of a session, with its number from 1 and the path of its file.
 
         An exception ends the series.
         """
 
-    def on_message(self, level: Literal["info", "warning"], text: str) -> None:
+    def on_message(self, level: Literal["info", "warning"], message_text: str) -> None:
         """Process a message for the operator before the first session."""
 
     def on_live_view(self, view_text: str) -> None:
@@ -116,7 +121,7 @@ class Series:
         self._notes = {
             note_name: note_text for note_name, note_text in (notes or {}).items() if note_text
         }
-        check_required(profile, self._notes)
+        require_metadata(profile, self._notes)
         if excitation.stays and session_count > 1:
             raise RefusedError(
                 f"--repeat {session_count}: a {excitation.kind} does not end where it starts, so "
@@ -198,7 +203,7 @@ class Series:
                 return
             self._require_disk_space()
             is_numbered = self._session_count > 1
-            session_path = choose_path(
+            session_path = choose_session_path(
                 self._folder, self._excitation.kind, session_number if is_numbered else None
             )
             session_notes = self._notes | (
@@ -224,7 +229,7 @@ class Series:
             )
             with contextlib.nullcontext() if quick_looks is None else quick_looks.suspended():
                 if with_live_view:
-                    listener.on_live_view(rig.show(session_order, stop))
+                    listener.on_live_view(rig.show_session(session_order, stop))
                 run_result = rig.run(session_order, stop, listener.on_progress, can_receive_stop)
             self.results.append(run_result)
             # The record of a vibration-free move contains no information on the modes.
@@ -269,6 +274,6 @@ def _await_quick_look(quick_looks: QuickLookQueue, rig: Rig, stop: StopRequest) 
     """Wait some seconds for the quick look at the previous session before the next session."""
     deadline_s = time.monotonic() + _QUICK_LOOK_MAX_PAUSE_S
     while quick_looks.busy and not stop.requested and time.monotonic() < deadline_s:
-        rig.watch()
+        rig.check_control_process()
         quick_looks.poll()
         time.sleep(_POLL_S)

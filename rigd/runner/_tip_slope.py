@@ -74,71 +74,83 @@ def is_exempt_chirp(excitation: Excitation) -> bool:
     )
 
 
-def is_physical(tip: TipMotion, beam: Beam) -> bool:
+def is_tip_motion_physical(predicted_tip_motion: TipMotion, beam: Beam) -> bool:
     """Return whether a predicted tip motion is physically possible.
 
     The motion is possible if the deflection is at most the beam's length, and the error of the
     linear model is below 100 %.
     """
-    return tip.deflection_m <= beam.length_m and linear_model_error(tip.slope_rad) < 1.0
+    return (
+        predicted_tip_motion.deflection_m <= beam.length_m
+        and linear_model_error(predicted_tip_motion.slope_rad) < 1.0
+    )
 
 
-def tip_document(tip: TipMotion | None, beam: Beam) -> dict[str, Any] | None:
+def tip_document(predicted_tip_motion: TipMotion | None, beam: Beam) -> dict[str, Any] | None:
     """Return the predicted motion of the tip as a dictionary for JSON, or None if unknown."""
-    if tip is None:
+    if predicted_tip_motion is None:
         return None
     return {
-        **asdict(tip),
-        "linear_model_error": linear_model_error(tip.slope_rad),
-        "physical": is_physical(tip, beam),
+        **asdict(predicted_tip_motion),
+        "linear_model_error": linear_model_error(predicted_tip_motion.slope_rad),
+        "physical": is_tip_motion_physical(predicted_tip_motion, beam),
     }
 
 
 def slope_remedy(excitation: Excitation, slope_rad: float, limit_rad: float) -> str:
     """Return text on how to change or allow a session that exceeds the limit of the tip slope."""
-    factor_text = ""
+    amplitude_text = ""
     if excitation.kind == "file":
         amplitude_factor = _rounded_down(limit_rad / slope_rad)
-        factor_text = f" to {amplitude_factor:g} of it" if amplitude_factor > 0 else ""
+        amplitude_text = f" to {amplitude_factor:g} of it" if amplitude_factor > 0 else ""
     exemption_text = (
         f" (chirps of up to {PAPER_AMPLITUDE_RAD:g} rad, as in the reference paper, are exempt)"
         if excitation.kind == "chirp"
         else ""
     )
-    allowed_rad = math.ceil(100 * slope_rad) / 100
-    return f"{factor_text}{exemption_text}, or allow it with --tip-slope {allowed_rad:g} (rad)"
+    suggested_limit_rad = math.ceil(100 * slope_rad) / 100
+    return (
+        f"{amplitude_text}{exemption_text}, or allow it with --tip-slope "
+        f"{suggested_limit_rad:g} (rad)"
+    )
 
 
-def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> str:
+def tip_in_words(predicted_tip_motion: TipMotion | None, beam: Beam, excitation: Excitation) -> str:
     """Return text on the predicted tip motion and the linear model's error; "" if unknown."""
-    if tip is None:
+    if predicted_tip_motion is None:
         return ""
-    linear_error = linear_model_error(tip.slope_rad)
-    if not is_physical(tip, beam):
-        error_text = f"up to {100 * linear_error:.2g}" if linear_error < 1.0 else "above 100"
+    relative_model_error = linear_model_error(predicted_tip_motion.slope_rad)
+    if not is_tip_motion_physical(predicted_tip_motion, beam):
+        error_percent_text = (
+            f"up to {100 * relative_model_error:.2g}" if relative_model_error < 1.0 else "above 100"
+        )
         motion_text = (
-            f"Predicted tip slope: {tip.slope_rad:.2g} rad. The linear model does not hold there "
-            f"(error {error_text} %): the predicted deflection is larger than the beam allows, and "
+            f"Predicted tip slope: {predicted_tip_motion.slope_rad:.2g} rad. The linear model "
+            "does not hold there "
+            f"(error {error_percent_text} %): the predicted deflection is larger than the beam "
+            "allows, and "
             "deflection and speed of the tip are not known"
         )
     else:
-        peak_fraction = tip.deflection_m / beam.length_m
+        deflection_fraction = predicted_tip_motion.deflection_m / beam.length_m
         motion_text = (
-            f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * peak_fraction:.2g} % of "
-            f"the length), tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
+            f"Predicted tip deflection: {predicted_tip_motion.deflection_m:.3g} m "
+            f"({100 * deflection_fraction:.2g} % of "
+            f"the length), tip speed {predicted_tip_motion.speed_m_s:.3g} m/s, slope "
+            f"{predicted_tip_motion.slope_rad:.2g} rad."
         )
-        if not tip.slope_rad > SMALL_SLOPE_RAD:
+        if not predicted_tip_motion.slope_rad > SMALL_SLOPE_RAD:
             return motion_text
         motion_text += (
             f" At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error at "
-            f"most {100 * linear_error:.2g} %), and air drag may limit the motion"
+            f"most {100 * relative_model_error:.2g} %), and air drag may limit the motion"
         )
     if excitation.kind in KINDS_WITH_TARGET_ANGLE:
         return f"{motion_text}{_STEEP_SLOPE_EFFECTS[excitation.kind]}."
     if excitation.kind not in KINDS:
         return f"{motion_text}; the identification of the motor does not depend on it."
-    amplitude_factor = _rounded_down(SMALL_SLOPE_RAD / tip.slope_rad)
-    advice = (
+    amplitude_factor = _rounded_down(SMALL_SLOPE_RAD / predicted_tip_motion.slope_rad)
+    amplitude_advice = (
         f"; {amplitude_factor:g} times the amplitude stays within" if amplitude_factor > 0 else ""
     )
     exemption_text = (
@@ -147,9 +159,9 @@ def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> s
         if is_exempt_chirp(excitation)
         else ""
     )
-    return f"{motion_text}{advice}.{exemption_text}"
+    return f"{motion_text}{amplitude_advice}.{exemption_text}"
 
 
-def _rounded_down(factor: float) -> float:
+def _rounded_down(amplitude_factor: float) -> float:
     """Return a factor rounded down to two decimals."""
-    return math.floor(100.0 * factor) / 100.0
+    return math.floor(100.0 * amplitude_factor) / 100.0

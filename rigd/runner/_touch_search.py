@@ -51,9 +51,10 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
     if not isinstance(excitation, TouchExcitation):
         return None
     if profile.tip_mass_kg:
-        source = profile.path if profile.specimen is None else profile.specimen.path
+        beam_file_path = profile.path if profile.specimen is None else profile.specimen.path
         raise RefusedError(
-            f"{source}: beam.tip_mass_kg = {profile.tip_mass_kg:.4g} kg: a search for touches does "
+            f"{beam_file_path}: beam.tip_mass_kg = {profile.tip_mass_kg:.4g} kg: a search for "
+            "touches does "
             "not take a mass at the tip into account; take it off, and remove the key."
         )
     from rigd.touch import DetectorSettings, TouchModel, detector_model
@@ -150,11 +151,11 @@ class TouchClient(WorkerClient):
         ``final`` is False.
         """
 
-        def are_final() -> bool:
+        def are_touches_final() -> bool:
             final_count = sum(touch_report.final for touch_report in self._reports.values())
             return final_count >= touch_count
 
-        self._wait(are_final, _FINAL_ESTIMATES_TIMEOUT_S, call_while_waiting)
+        self._wait(are_touches_final, _FINAL_ESTIMATES_TIMEOUT_S, call_while_waiting)
         return [
             _touch_document(touch_number, self._reports.get(touch_number))
             for touch_number in range(1, touch_count + 1)
@@ -182,9 +183,13 @@ class TouchClient(WorkerClient):
             self._events.append(LogEvent(0, "info", touch_line(touch_document), notable=True))
 
 
-def _touch_document(number: int, report: TouchReport | None) -> dict[str, Any]:
+def _touch_document(touch_number: int, touch_report: TouchReport | None) -> dict[str, Any]:
     """Return a touch as a dictionary for JSON: its number, and its estimate if there is one."""
-    if report is None:
-        return {"number": number}
+    if touch_report is None:
+        return {"number": touch_number}
     # A first estimate may be the only one.
-    return {"number": number, **report.document, **({} if report.final else {"final": False})}
+    return {
+        "number": touch_number,
+        **touch_report.document,
+        **({} if touch_report.final else {"final": False}),
+    }

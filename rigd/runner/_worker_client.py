@@ -64,11 +64,14 @@ class WorkerClient(ABC):
     def check(self) -> None:
         """Process the received messages; restart a hung worker, or give it up."""
         if self.process_messages(0.0) and self.worker.max_silence_s is not None:
-            limit_s = self.worker.max_silence_s if self._is_ready else self.worker.start_timeout_s
-            if self._group.stalled_s(self.worker) > limit_s:
+            silence_limit_s = (
+                self.worker.max_silence_s if self._is_ready else self.worker.start_timeout_s
+            )
+            if self._group.stalled_s(self.worker) > silence_limit_s:
                 self._group[self.worker].kill()
                 self._restart_or_give_up(
-                    f"The {self.worker.name} process was killed: no response for {limit_s:g} s."
+                    f"The {self.worker.name} process was killed: no response for "
+                    f"{silence_limit_s:g} s."
                 )
 
     def process_messages(self, timeout_s: float) -> bool:
@@ -107,7 +110,7 @@ class WorkerClient(ABC):
 
     def _wait(
         self,
-        is_met: Callable[[], bool],
+        is_condition_met: Callable[[], bool],
         timeout_s: float,
         call_while_waiting: Callable[[], bool | None],
     ) -> bool:
@@ -116,12 +119,12 @@ class WorkerClient(ABC):
         The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
         """
         deadline_s = time.monotonic() + timeout_s
-        while not (is_met() or self.failure):
+        while not (is_condition_met() or self.failure):
             self.process_messages(_POLL_S)
             if call_while_waiting() is False:
                 break
             if time.monotonic() > deadline_s:
-                return is_met() or bool(self.failure)
+                return is_condition_met() or bool(self.failure)
         return True
 
     def _restart_or_give_up(self, reason: str) -> None:

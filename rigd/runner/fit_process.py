@@ -42,7 +42,7 @@ _FIT_INTERVAL_S: Final = 1.0
 _PERIODIC_NICENESS: Final = 19
 """Niceness of the thread that makes estimates at intervals, for which nobody waits. With SCHED_IDLE
 instead, the thread could hold the interpreter lock while a busy computer does not run it."""
-_TICK_BEYOND_ALL: Final = 1 << 32
+_TICK_AFTER_ALL_SAMPLES: Final = 1 << 32
 """Tick after the last tick of any session, to request an estimate from all samples."""
 _FIRST_REQUEST_ID: Final = 1_000_000_000
 """First identification number of requested estimates; periodic estimates are numbered from 0."""
@@ -149,12 +149,12 @@ class EstimatorThread:
             If the estimator has failed.
         """
         try:
-            result = self._results.get_nowait()
+            result_or_error = self._results.get_nowait()
         except queue.Empty:
             return None
-        if isinstance(result, Exception):
-            raise EstimationError(f"The fit has failed ({result!r}).") from result
-        return result
+        if isinstance(result_or_error, Exception):
+            raise EstimationError(f"The fit has failed ({result_or_error!r}).") from result_or_error
+        return result_or_error
 
     def _run(
         self,
@@ -167,18 +167,22 @@ class EstimatorThread:
             if interval_s is not None:
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _PERIODIC_NICENESS)
             estimator: _OnlineEstimator = pkgutil.resolve_name(ONLINE_ESTIMATOR)(metadata, segments)
-            due_s = None if interval_s is None else time.monotonic() + interval_s
+            next_fit_due_s = None if interval_s is None else time.monotonic() + interval_s
             periodic_count = 0
             while True:
                 try:
                     next_input = self._inputs.get(
-                        timeout=None if due_s is None else max(due_s - time.monotonic(), 0)
+                        timeout=None
+                        if next_fit_due_s is None
+                        else max(next_fit_due_s - time.monotonic(), 0)
                     )
                 except queue.Empty:
                     # All samples read so far are in the estimate.
                     assert interval_s is not None
-                    due_s = time.monotonic() + interval_s
-                    next_input = EstimateRequest(periodic_count, _TICK_BEYOND_ALL, whole=False)
+                    next_fit_due_s = time.monotonic() + interval_s
+                    next_input = EstimateRequest(
+                        periodic_count, _TICK_AFTER_ALL_SAMPLES, whole=False
+                    )
                     periodic_count += 1
                 if isinstance(next_input, EstimateRequest):
                     self._results.put(_estimate_document(estimator, next_input))
@@ -194,19 +198,19 @@ def _estimate_document(estimator: _OnlineEstimator, request: EstimateRequest) ->
         request.tick, whole=request.whole, from_last=request.from_last
     )
     document = {"id": request.id, **online_estimate.as_json()}
-    plain_document: dict[str, Any] = json.loads(json.dumps(document, allow_nan=False))
-    return plain_document
+    json_document: dict[str, Any] = json.loads(json.dumps(document, allow_nan=False))
+    return json_document
 
 
 class _SessionFit:
     """Fit of one session: passes samples to the estimator, and estimates to the supervisor."""
 
-    def __init__(self, job: FitJob, parent: SupervisorConnection, channels: Channels) -> None:
+    def __init__(self, fit_job: FitJob, parent: SupervisorConnection, channels: Channels) -> None:
         self._parent = parent
         self._estimator = EstimatorThread()
         self._shared_state = channels.shared_state
-        self._reader = RingObserver(channels.samples, job.first_index)
-        self._job = job
+        self._reader = RingObserver(channels.samples, fit_job.first_index)
+        self._job = fit_job
         self._search: ExcitationPlanner | None = None
         self._pending: EstimateRequest | None = None  # request without an estimate so far
         self._is_early_fit_pending = False  # whether it only provides start values for the next fit
@@ -239,7 +243,9 @@ class _SessionFit:
                             self._shared_state[StateField.BEGUN_REFERENCE_TICKS],
                         )
                         self._parent.send(
-                            self._search.end_of_record(ticks, held_ticks_before, begun_segment_end)
+                            self._search.record_end_message(
+                                ticks, held_ticks_before, begun_segment_end
+                            )
                         )
 
     def _start_fits(self, header: FileHeader) -> None:
@@ -249,7 +255,7 @@ class _SessionFit:
             reference_writer = ReferenceWriter(job.reference, self._shared_state)
             start_rad = float(header.metadata["start_angle_rad"])
             self._search = ExcitationPlanner(
-                job.search, job.profile, reference_writer, start_rad=start_rad
+                job.search, job.profile, reference_writer, start_angle_rad=start_rad
             )
         fit_interval_s = _FIT_INTERVAL_S if job.search is None else None
         self._estimator.begin(header.metadata, header.segments, fit_interval_s)
@@ -298,13 +304,13 @@ class _SessionFit:
         )
         self._estimator.request(self._pending)
 
-    def _process_estimate(self, estimate: dict[str, Any]) -> bool:
+    def _process_estimate(self, estimate_document: dict[str, Any]) -> bool:
         """Report an estimate to the supervisor, or plan the next segment with the estimate.
 
         Returns whether this was the final estimate, from the whole record.
         """
         pending_request, excitation_planner = self._pending, self._search
-        if pending_request is not None and pending_request.id != estimate["id"]:
+        if pending_request is not None and pending_request.id != estimate_document["id"]:
             pending_request = None
         # Only the last estimate is requested without start values from the previous one.
         is_final = (
@@ -317,34 +323,34 @@ class _SessionFit:
             self._pending, self._is_early_fit_pending = None, False
         if excitation_planner is not None and not is_final:
             if pending_request is not None and self._record_ticks is None and not was_early_fit:
-                self._plan_next_segment(excitation_planner, pending_request, estimate)
+                self._plan_next_segment(excitation_planner, pending_request, estimate_document)
             return False
-        estimate["text"] = estimate_lines(estimate, self._previous_estimate)
+        estimate_document["text"] = estimate_lines(estimate_document, self._previous_estimate)
         if excitation_planner is None:
-            self._previous_estimate = estimate
+            self._previous_estimate = estimate_document
         else:
-            estimate["search"] = excitation_planner.targets_document(estimate)
-        self._parent.send(FitReport(estimate, final=is_final))
+            estimate_document["search"] = excitation_planner.targets_document(estimate_document)
+        self._parent.send(FitReport(estimate_document, final=is_final))
         return is_final
 
     def _plan_next_segment(
         self,
         excitation_planner: ExcitationPlanner,
-        request: EstimateRequest,
-        estimate: dict[str, Any],
+        estimate_request: EstimateRequest,
+        estimate_document: dict[str, Any],
     ) -> None:
         """Plan the next segment from an estimate, and send the plan to the supervisor."""
         held_ticks, held_ticks_before = (
             self._shared_state[StateField.HELD_TICKS],
             self._shared_state[StateField.HELD_TICKS_BEFORE_SEGMENT],
         )
-        for planner_message in excitation_planner.plan_next(
-            estimate, held_ticks, held_ticks_before
+        for planner_message in excitation_planner.plan_next_segment(
+            estimate_document, held_ticks, held_ticks_before
         ):
             self._parent.send(planner_message)
         if excitation_planner.needs_early_fit:
             # This fit of all structures provides start values for the check of the whole record.
-            self._request_estimate(request.tick, whole=True, from_last=True)
+            self._request_estimate(estimate_request.tick, whole=True, from_last=True)
             self._is_early_fit_pending = True
 
 

@@ -42,7 +42,7 @@ ComplexArray = NDArray[np.complex128]
 
 _MAX_AMPLITUDE_RAD = 2.0 * math.pi
 """Maximum amplitude in rad that `largest_amplitude` proposes."""
-_MAX_ITERATIONS = 10
+_MAX_AMPLITUDE_ITERATIONS = 10
 """Maximum number of iterations of the search for the largest amplitude, which takes 3 or 4."""
 _UNKNOWN_FORCE_WARNING = (
     "Without sensor.shear_projection in the profile the contact force is not known: force_limit_n "
@@ -101,13 +101,13 @@ class RigPreview:
     ----------
     profile
         Profile of the rig. The closed loop is computed when it is first needed.
-    start_rad
+    start_angle_rad
         Motor angle at the start of the session, relative to the rig's zero.
     """
 
-    def __init__(self, profile: Profile, start_rad: float = 0.0) -> None:
+    def __init__(self, profile: Profile, start_angle_rad: float = 0.0) -> None:
         self._profile = profile
-        self.start_rad = start_rad
+        self.start_rad = start_angle_rad
         self._last_estimated_plant: tuple[Plant, MovePlant] | None = None
 
     @property
@@ -124,8 +124,8 @@ class RigPreview:
     def stated_estimate(self) -> BeamEstimate:
         """Beam estimate with the profile's values and sensor noise, to design excitations."""
         rig = self._profile.rig
-        density_nm2_per_hz = 2.0 * torque_noise_nm(self._profile) ** 2 / rig.rate_hz
-        return BeamEstimate.stated(self._profile.plant, density_nm2_per_hz)
+        noise_density_nm2_per_hz = 2.0 * torque_noise_nm(self._profile) ** 2 / rig.rate_hz
+        return BeamEstimate.stated(self._profile.plant, noise_density_nm2_per_hz)
 
     @cached_property
     def _closed_loop(self) -> ClosedLoop:
@@ -224,7 +224,7 @@ class RigPreview:
 
 
 def excitation_for(
-    profile: Profile, kind: str, parameters: Mapping[str, Value], start_rad: float = 0.0
+    profile: Profile, kind: str, parameters: Mapping[str, Value], start_angle_rad: float = 0.0
 ) -> Excitation:
     """Return the excitation with the given kind and parameters for the rig of a profile.
 
@@ -234,12 +234,14 @@ def excitation_for(
         Profile of the rig.
     kind, parameters
         Name and parameters of the excitation, as for `rigd.excitation.make_excitation`.
-    start_rad
+    start_angle_rad
         Motor angle at the start of the session, relative to the rig's zero. Only moves need it.
     """
     if "tip_slope_rad" in inspect.signature(KINDS[kind]).parameters:
         parameters = {"tip_slope_rad": profile.limits.tip_slope_rad} | dict(parameters)
-    return make_excitation(kind, parameters, profile.rig.rate_hz, RigPreview(profile, start_rad))
+    return make_excitation(
+        kind, parameters, profile.rig.rate_hz, RigPreview(profile, start_angle_rad)
+    )
 
 
 def plan_session(
@@ -354,7 +356,7 @@ def predict_session(
         tip_in_words=tip_in_words(prediction.tip, profile.rig.beam, excitation),
         refused="\n".join(refusals),
         ending=_motion_after_record(
-            closed_loop, stays=excitation.stays, damped=profile.is_loop_modelled
+            closed_loop, stays_at_end=excitation.stays, is_controller_known=profile.is_loop_modelled
         ),
         offline_check_result=offline_check,
     )
@@ -364,20 +366,26 @@ def _amplitude_advice(profile: Profile, excitation: Excitation, *, allows_satura
     """Return advice, as part of an error message, on how to change an excitation within limits."""
     if excitation.kind in KINDS_WITH_TARGET_ANGLE:
         return "reduce the angle or the speed"
-    largest_rad = largest_amplitude(profile, excitation, allows_saturation=allows_saturation)
-    return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
+    largest_amplitude_rad = largest_amplitude(
+        profile, excitation, allows_saturation=allows_saturation
+    )
+    return "lower the amplitude" + (
+        "" if largest_amplitude_rad is None else f" to {largest_amplitude_rad:g} rad"
+    )
 
 
-def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> PostRecordPlan:
+def _motion_after_record(
+    closed_loop: ClosedLoop, *, stays_at_end: bool, is_controller_known: bool
+) -> PostRecordPlan:
     """Return the plan for the motion after the record: active damping, then the return.
 
-    `stays` states that the motor does not return to its start. `damped` must be False if the
-    controller is not known, for which active damping cannot be designed.
+    `stays_at_end` states that the motor does not return to its start. `is_controller_known` must be
+    False if the controller is not known, for which active damping cannot be designed.
     """
-    if loop.model.plant is None:
-        return PostRecordPlan(stays=stays)
-    damper = design_damper(loop) if damped else None
-    return PostRecordPlan(stays, tuple(map(complex, mode_poles(loop)[1])), damper)
+    if closed_loop.model.plant is None:
+        return PostRecordPlan(stays=stays_at_end)
+    damper = design_damper(closed_loop) if is_controller_known else None
+    return PostRecordPlan(stays_at_end, tuple(map(complex, mode_poles(closed_loop)[1])), damper)
 
 
 def largest_amplitude(
@@ -428,7 +436,7 @@ def largest_amplitude(
 
     # All peaks are proportional to the amplitude, except for the friction compensation.
     amplitude_rad = min(stated_amplitude_rad, _MAX_AMPLITUDE_RAD)
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(_MAX_AMPLITUDE_ITERATIONS):
         limit_fraction = largest_fraction_at(amplitude_rad)
         if not 0.0 < limit_fraction < math.inf:
             return None
@@ -511,8 +519,10 @@ def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPredictio
         predicted_peaks = replace(predicted_peaks, tip=tip)
     if excitation.kind not in KINDS_WITH_TARGET_ANGLE:
         return predicted_peaks
-    start_rad = float(excitation.parameters["angle_rad"]) - float(excitation.parameters["by_rad"])
-    return replace(predicted_peaks, peak_angle_rad=_peak(start_rad + angle_rad))
+    start_angle_rad = float(excitation.parameters["angle_rad"]) - float(
+        excitation.parameters["by_rad"]
+    )
+    return replace(predicted_peaks, peak_angle_rad=_peak_magnitude(start_angle_rad + angle_rad))
 
 
 def _peaks_and_angle(
@@ -524,18 +534,18 @@ def _peaks_and_angle(
     """
     angle_rad = np.empty(reference_rad.size)
     peaks = np.zeros(5)
-    end = 0
+    chunk_end = 0
     for chunk in closed_loop.simulate_in_chunks(reference_rad):
-        begin, end = end, end + chunk.angle_rad.size
-        angle_rad[begin:end] = chunk.angle_rad
+        chunk_begin, chunk_end = chunk_end, chunk_end + chunk.angle_rad.size
+        angle_rad[chunk_begin:chunk_end] = chunk.angle_rad
         signals = (
             chunk.angle_rad,
             chunk.velocity_rad_s,
             chunk.torque_nm,
-            reference_rad[begin:end] - chunk.angle_rad,
+            reference_rad[chunk_begin:chunk_end] - chunk.angle_rad,
             chunk.coupling_torque_nm,
         )
-        peaks = np.maximum(peaks, [_peak(signal) for signal in signals])
+        peaks = np.maximum(peaks, [_peak_magnitude(signal) for signal in signals])
     angle, velocity, torque, tracking_error, coupling_torque = map(float, peaks)
     prediction = SessionPrediction(angle, velocity, torque, tracking_error, coupling_torque)
     return prediction, angle_rad
@@ -565,19 +575,21 @@ def predicted_metadata(
     metadata = {}
     tip_slope = _limited_tip_slope(profile, prediction)
     if tip_slope is not None:
-        largest_rad = max(tip_slope.value, excitation.later_tip_slope_rad)
-        tip_slope = replace(tip_slope, value=largest_rad)
+        largest_tip_slope_rad = max(tip_slope.value, excitation.later_tip_slope_rad)
+        tip_slope = replace(tip_slope, value=largest_tip_slope_rad)
     for limited_peak in (
         *unclippable_peaks,
         *clippable_peaks,
         *(() if tip_slope is None else (tip_slope,)),
     ):
-        metadata[f"predicted_peak_{_METADATA_KEYS[limited_peak.name]}"] = repr(limited_peak.value)
-        metadata[f"limit_{_METADATA_KEYS[limited_peak.name]}"] = repr(limited_peak.limit)
+        metadata[f"predicted_peak_{_METADATA_KEY_BY_PEAK[limited_peak.name]}"] = repr(
+            limited_peak.value
+        )
+        metadata[f"limit_{_METADATA_KEY_BY_PEAK[limited_peak.name]}"] = repr(limited_peak.limit)
     return metadata
 
 
-_METADATA_KEYS = {
+_METADATA_KEY_BY_PEAK = {
     "angle": "angle_rad",
     "speed": "velocity_rad_s",
     "tracking error": "tracking_error_rad",
@@ -680,6 +692,6 @@ def _sensor_limit_nm(profile: Profile) -> float:
     )
 
 
-def _peak(signal: RealArray) -> float:
+def _peak_magnitude(signal: RealArray) -> float:
     """Return the largest magnitude in an array."""
     return float(np.max(np.abs(signal)))

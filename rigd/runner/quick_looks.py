@@ -23,7 +23,7 @@ from rigd.session.quick_look import quick_look_path, read_quick_look
 
 _MAX_RUN_TIME_S: Final = 60.0
 """Maximum run time of a quick look in seconds, without suspensions and waits for a processor."""
-_MAX_WAITING: Final = 3
+_MAX_WAITING_SESSIONS: Final = 3
 """Maximum number of waiting quick looks, above which the oldest waiting quick look is skipped."""
 _MAX_ERROR_CHARACTERS: Final = 500
 """Maximum number of characters of an error message that are shown."""
@@ -33,11 +33,11 @@ _MAX_ERROR_CHARACTERS: Final = 500
 class QuickLook:
     """Quick look at one session, or the reason why it failed."""
 
-    session: Path
+    session_path: Path
     """Path of the session file."""
     path: Path | None
     """Path of the quick look's file, or None if the quick look failed."""
-    content: dict[str, Any] | None
+    report_content: dict[str, Any] | None
     """Content of the quick look's file, or None if the quick look failed."""
     error: str
     """Sentence that states why the quick look failed; empty if it did not."""
@@ -69,19 +69,19 @@ class QuickLook:
     @property
     def lines(self) -> list[str]:
         """Lines of text that report the quick look on a terminal."""
-        if self.content is None:
-            return [f"No quick look at {self.session.name}: {self.error}"]
-        return [printable(str(text_line)) for text_line in self.content["text"]]
+        if self.report_content is None:
+            return [f"No quick look at {self.session_path.name}: {self.error}"]
+        return [printable(str(text_line)) for text_line in self.report_content["text"]]
 
     def add_path_to_results(self, results: list[SessionResult]) -> None:
         """Add the path of the quick look to the result of its session in a list of results."""
         for result_index, run_result in enumerate(results):
-            if run_result.path == self.session:
+            if run_result.path == self.session_path:
                 results[result_index] = replace(run_result, quick_look=self.path)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the daemon's event that reports the quick look."""
-        return {"path": str(self.session), "look": self.content, "error": self.error}
+        return {"path": str(self.session_path), "look": self.report_content, "error": self.error}
 
 
 class QuickLookQueue:
@@ -193,7 +193,7 @@ class QuickLookQueue:
 
     def _start_next(self) -> Iterator[QuickLook]:
         """Start the next quick look; yield the quick looks that are skipped or cannot start."""
-        while len(self._waiting_sessions) > _MAX_WAITING:
+        while len(self._waiting_sessions) > _MAX_WAITING_SESSIONS:
             yield QuickLook.failed(
                 self._waiting_sessions.popleft(), "skipped in favour of later sessions."
             )

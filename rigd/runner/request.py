@@ -78,7 +78,7 @@ class SessionOrder:
     """Whether the record is fitted repeatedly, even if the end of the session is planned."""
     seed: int | None = None
     """Seed of a simulated rig's noise, or None for a random seed."""
-    accepted: tuple[FailedCheck, ...] = ()
+    accepted_checks: tuple[FailedCheck, ...] = ()
     """Failed checks of the profile that the operator accepted."""
 
     @property
@@ -130,9 +130,11 @@ def load_rig(
     software_commit()  # called early, because it is slow and the motor is held during the header
     profile = load_profile(profile_name)
     check_selection(profile.rig.devices, profile.path)
-    refusals = bus_conflicts(profile.rig)
-    if refusals:
-        raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
+    bus_conflict_texts = bus_conflicts(profile.rig)
+    if bus_conflict_texts:
+        raise RefusedError(
+            "\n".join(f"{profile.path}: {refusal}" for refusal in bus_conflict_texts)
+        )
     target = actuation_target(profile.rig)
     if force_hardware and target is not ActuationTarget.HARDWARE:
         raise RefusedError(
@@ -141,12 +143,12 @@ def load_rig(
         )
     if target is ActuationTarget.HARDWARE and not force_hardware:
         _refuse_unreachable_simulators(profile)
-    options = {
+    is_given_by_option = {
         "--fast": uses_virtual_clock,
         "--seed": seed is not None,
         "--obstacle": bool(obstacles),
     }
-    simulation_options = [option for option, is_given in options.items() if is_given]
+    simulation_options = [option for option, is_given in is_given_by_option.items() if is_given]
     if target is ActuationTarget.HARDWARE and simulation_options:
         raise RefusedError(
             f"{simulation_options[0]}: {profile.path} is a profile of hardware, and the option is "
@@ -199,7 +201,7 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
         )
 
 
-def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
+def require_metadata(profile: Profile, notes: Mapping[str, str]) -> None:
     """Raise if a session lacks metadata that its profile requires.
 
     Parameters
@@ -291,7 +293,7 @@ def require_disk_space(folder: Path, excitation: Excitation, limits: Limits) -> 
         )
 
 
-def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
+def choose_session_path(folder: Path, kind: str, session_number: int | None = None) -> Path:
     """Return an unused path for a session file, made from time, excitation and number.
 
     The file is not created. The recorder later refuses the path if a file exists there by then.
@@ -302,12 +304,12 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
         Folder of the session files.
     kind
         Name of the excitation.
-    number
+    session_number
         Number of the session in its series, or None for a single session.
     """
     file_stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
-    if number is not None:
-        file_stem += f"-{number:02d}"
+    if session_number is not None:
+        file_stem += f"-{session_number:02d}"
     session_path = folder / f"{file_stem}.mcap"
     return _unused_path(session_path)
 
@@ -376,25 +378,25 @@ def remaining_file_text(session_path: Path | None) -> str:
 
 
 def file_header(
-    order: SessionOrder, connection: DevicesConnected, tare: Mapping[str, str]
+    session_order: SessionOrder, connection: DevicesConnected, tare_metadata: Mapping[str, str]
 ) -> FileHeader:
     """Return the metadata, segments and attachments with which a session file begins.
 
     Parameters
     ----------
-    order
+    session_order
         The session.
     connection
         Devices and real-time settings that the control process has reported.
-    tare
+    tare_metadata
         Metadata of the tare, and the seed of a simulated rig's noise.
     """
-    specimen = order.profile.specimen
+    specimen = session_order.profile.specimen
     return FileHeader(
-        metadata=_session_metadata(order, connection, tare),
-        segments=dict(order.excitation.segments),
+        metadata=_session_metadata(session_order, connection, tare_metadata),
+        segments=dict(session_order.excitation.segments),
         attachments={
-            "profile.toml": order.profile.text,
+            "profile.toml": session_order.profile.text,
             **({} if specimen is None else {"specimen.toml": specimen.text}),
             "calibration.json": json.dumps(connection.calibration, indent=1),
         },
@@ -402,19 +404,19 @@ def file_header(
 
 
 def _session_metadata(
-    order: SessionOrder, connection: DevicesConnected, tare: Mapping[str, str]
+    session_order: SessionOrder, connection: DevicesConnected, tare_metadata: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the record ``session`` of a session file: key → text."""
-    rig = order.profile.rig
+    rig = session_order.profile.rig
     metadata = {
-        "id": order.path.stem,
+        "id": session_order.path.stem,
         "rate_hz": repr(rig.rate_hz),
-        "excitation": order.excitation.kind,
-        "uniformity_percent": repr(order.profile.uncertainty.uniformity_percent),
+        "excitation": session_order.excitation.kind,
+        "uniformity_percent": repr(session_order.profile.uncertainty.uniformity_percent),
         # The parameters of a session may override the uniformity.
         **{
             parameter_name: _parameter_text(parameter_value)
-            for parameter_name, parameter_value in order.excitation.parameters.items()
+            for parameter_name, parameter_value in session_order.excitation.parameters.items()
         },
         "beam_length_m": repr(rig.beam.length_m),
         "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
@@ -425,13 +427,13 @@ def _session_metadata(
         "actuation_delay_s": repr(rig.actuation.delay_s),
         **{
             f"uncertainty_{k}": repr(v)
-            for k, v in order.profile.uncertainty.nonzero_percent_by_field.items()
+            for k, v in session_order.profile.uncertainty.nonzero_percent_by_field.items()
         },
         "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
         "drive": rig.devices.drive,
         "sensor": rig.devices.sensor,
         "simulated": str(connection.simulated).lower(),
-        "profile": order.profile.name,
+        "profile": session_order.profile.name,
         "software": f"rigd {__version__}",
         **software_commit(),
         "host": platform.node(),
@@ -440,13 +442,13 @@ def _session_metadata(
             for setting_name, setting_text in connection.realtime.items()
         },
         **connection.drive,
-        **tare,
-        **dict(order.predicted_metadata),
-        **dict(order.notes),
+        **tare_metadata,
+        **dict(session_order.predicted_metadata),
+        **dict(session_order.notes),
     }
-    if order.accepted:
+    if session_order.accepted_checks:
         metadata["accepted_checks"] = ", ".join(
-            accepted_check.name for accepted_check in order.accepted
+            accepted_check.name for accepted_check in session_order.accepted_checks
         )
     serial_number = connection.calibration.get("serial_number")
     if isinstance(serial_number, str):
@@ -459,14 +461,14 @@ def _session_metadata(
         metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)
     metadata = (
         _device_metadata(rig)
-        | _controller_metadata(order.profile)
-        | _excitation_metadata(order.excitation.kind)
+        | _controller_metadata(session_order.profile)
+        | _excitation_metadata(session_order.excitation.kind)
         | metadata
     )
-    if order.profile.tip_mass_kg is not None:
-        metadata["tip_mass_kg"] = repr(order.profile.tip_mass_kg)
-    if order.profile.axis_tilt_deg is not None:
-        metadata["axis_tilt_deg"] = repr(order.profile.axis_tilt_deg)
+    if session_order.profile.tip_mass_kg is not None:
+        metadata["tip_mass_kg"] = repr(session_order.profile.tip_mass_kg)
+    if session_order.profile.axis_tilt_deg is not None:
+        metadata["axis_tilt_deg"] = repr(session_order.profile.axis_tilt_deg)
     if any(rig.sensor.shear_projection):
         metadata["shear_projection"] = ",".join(map(repr, rig.sensor.shear_projection))
     if rig.sensor.filter_hz > 0:
@@ -520,16 +522,16 @@ def software_commit() -> dict[str, str]:
     checkout_folder = Path(__file__).resolve().parents[2]
     if not (checkout_folder / ".git").exists():
         return {}
-    command = ["git", "--no-optional-locks", "-C", str(checkout_folder), "describe"]
-    command += ["--always", "--dirty", "--abbrev=12"]
+    git_command = ["git", "--no-optional-locks", "-C", str(checkout_folder), "describe"]
+    git_command += ["--always", "--dirty", "--abbrev=12"]
     try:
         git_result = subprocess.run(
-            command, capture_output=True, text=True, timeout=_GIT_TIMEOUT_S, check=True
+            git_command, capture_output=True, text=True, timeout=_GIT_TIMEOUT_S, check=True
         )
     except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
         return {}
-    commit = git_result.stdout.strip()
-    return {"software_commit": commit} if commit.isprintable() and commit else {}
+    commit_name = git_result.stdout.strip()
+    return {"software_commit": commit_name} if commit_name.isprintable() and commit_name else {}
 
 
 def _parameter_text(parameter_value: float | str) -> str:

@@ -213,13 +213,13 @@ class SessionSupervisor:
 
     Parameters
     ----------
-    order
+    session_order
         Session to run.
     group
         Processes of the rig. The control process must be connected to the devices and idle.
     connection
         Message that the control process sent after it had connected to the devices.
-    live
+    live_view
         Live view that shows the session, or None.
     on_progress
         Called about fifty times a second with the progress and the events since the last call.
@@ -235,17 +235,17 @@ class SessionSupervisor:
 
     def __init__(
         self,
-        order: SessionOrder,
+        session_order: SessionOrder,
         group: ProcessGroup,
         connection: DevicesConnected,
-        live: LiveViewClient | None,
+        live_view: LiveViewClient | None,
         on_progress: ProgressCallback,
         can_receive_stop: Callable[[], bool],
     ) -> None:
-        self._order = order
+        self._order = session_order
         self._group = group
         self._connection = connection
-        self._live = live
+        self._live_view = live_view
         self._shared_state = group.channels.shared_state
         self._events = RingObserver(group.channels.events)
         self._on_progress = on_progress
@@ -325,7 +325,7 @@ class SessionSupervisor:
         session_order = self._order
         self._is_control_busy = True
         touch_order = None if session_order.touch is None else session_order.touch.order
-        job = SessionJob(
+        session_job = SessionJob(
             session_order.profile,
             reference_spec,
             self._refused_realtime_settings(),
@@ -334,10 +334,10 @@ class SessionSupervisor:
             session_order.seed,
             tuple(
                 f"{accepted_check.name}: {accepted_check.text}"
-                for accepted_check in session_order.accepted
+                for accepted_check in session_order.accepted_checks
             ),
         )
-        process_group.control.send(job)
+        process_group.control.send(session_job)
         control_message = self._await_control()
         if isinstance(control_message, ReadyToRecord):
             file_header_data = file_header(session_order, self._connection, control_message.tare)
@@ -354,7 +354,7 @@ class SessionSupervisor:
 
     def _report_and_check_stop(self) -> bool:
         """Report progress before any motion; return False if a stop is requested."""
-        self._report()
+        self._report_progress()
         return self._shared_state[StateField.STOP_REASON] == StopReason.NONE
 
     def _open_file(self) -> None:
@@ -362,8 +362,10 @@ class SessionSupervisor:
         process_group = self._group
         realtime_settings = None if self._is_virtual_clock else self._order.profile.realtime
         for _ in range(_MAX_FILE_NAMES):
-            job = RecorderJob(self._order.path, process_group.channels.specs, realtime_settings)
-            process_group.idle_process(RECORDER).start(job)
+            recorder_job = RecorderJob(
+                self._order.path, process_group.channels.specs, realtime_settings
+            )
+            process_group.idle_process(RECORDER).start(recorder_job)
             try:
                 opened_reply = self._await_recorder(FileOpened, _RECORDER_START_TIMEOUT_S)
             except _FileExistsError as error:
@@ -407,7 +409,7 @@ class SessionSupervisor:
                 control_message = self._group.control.poll(0.0 if has_waited else _POLL_S)
             except ChildError as error:
                 return self._control_died(f"{error} {WITHOUT_HEARTBEAT_TEXT}")
-            self._report()
+            self._report_progress()
             now_s = time.monotonic()
             # In lock-step with a simulated rig, a tick may wait for missing replies.
             is_torque_on = (
@@ -520,7 +522,7 @@ class SessionSupervisor:
         recorder_message = None
         while recorder_message is None and time.monotonic() < deadline_s:
             recorder_message = self._group.recorder.poll(_POLL_S)
-            self._report()
+            self._report_progress()
         if recorder_message is None:
             raise SessionFailedError(
                 f"The recorder process does not answer within {timeout_s:g} s. Check CPU load and "
@@ -535,24 +537,24 @@ class SessionSupervisor:
             raise SessionFailedError(f"The recorder process answers {recorder_message}.")
         return recorder_message
 
-    def _report(self) -> None:
+    def _report_progress(self) -> None:
         """Increment the supervisor's heartbeat, and report progress, events and fits."""
         shared_state = self._shared_state
         if self._can_receive_stop():
             shared_state.beat(StateField.SUPERVISOR_BEAT)
         new_events = read_events(self._events.take(16))
-        if self._live is not None:
-            new_events += self._live.poll()
+        if self._live_view is not None:
+            new_events += self._live_view.poll()
         if self._touches is not None:
             new_events += self._touches.poll()
-            if self._live is not None:
-                self._live.show_touches(self._touches.take_new_estimates())
+            if self._live_view is not None:
+                self._live_view.show_touches(self._touches.take_new_estimates())
         new_fits: Sequence[Mapping[str, Any]] = ()
         if self._fit is not None:
             new_events += self._fit.poll()
             new_fits = self._fit.take_new_estimates()
-            if self._live is not None:
-                self._live.show_fits(new_fits)
+            if self._live_view is not None:
+                self._live_view.show_fits(new_fits)
         self._on_progress(
             SessionProgress(
                 Phase(shared_state[StateField.PHASE]),
@@ -564,43 +566,48 @@ class SessionSupervisor:
             new_events,
         )
 
-    def _close(self, finished: SessionFinished) -> SessionResult:
+    def _close(self, finished_message: SessionFinished) -> SessionResult:
         """Complete touches and fit, make the recorder close the file, and return the result."""
-        self._report()
+        self._report_progress()
         touch_documents = None
         outcome_record = {
-            "outcome": finished.outcome,
-            "reason": finished.reason,
-            **{count_name: str(tick_count) for count_name, tick_count in finished.counts.items()},
-            **finished.results,
+            "outcome": finished_message.outcome,
+            "reason": finished_message.reason,
+            **{
+                count_name: str(tick_count)
+                for count_name, tick_count in finished_message.counts.items()
+            },
+            **finished_message.results,
         }
         if self._touches is not None:
             touch_documents = self._touches.finish(
-                self._shared_state[StateField.TOUCHES], self._report
+                self._shared_state[StateField.TOUCHES], self._report_progress
             )
             outcome_record["touches"] = json.dumps(touch_documents)
-            self._report()
-        fit: dict[str, Any] | None = None
+            self._report_progress()
+        fit_document: dict[str, Any] | None = None
         segment_ticks: Mapping[str, tuple[int, int]] = {}
         if self._fit is not None:
-            fit = self._fit.finish(finished.counts["scheduled"], self._report)
+            fit_document = self._fit.finish(
+                finished_message.counts["scheduled"], self._report_progress
+            )
             segment_ticks = self._fit.segments
-            self._report()
-            outcome_record["fit"] = json.dumps(fit)
-            if finished.outcome == "complete" and not finished.reason:
+            self._report_progress()
+            outcome_record["fit"] = json.dumps(fit_document)
+            if finished_message.outcome == "complete" and not finished_message.reason:
                 outcome_record["reason"] = self._fit.unmet_reason
             elif self._fit.search_failure:
                 # This failure ends the session, even if a stop was requested before.
-                outcome_record["reason"] = f"{self._fit.search_failure} {finished.reason}"
+                outcome_record["reason"] = f"{self._fit.search_failure} {finished_message.reason}"
         self._group.recorder.resume()
         packed_touches = b"" if self._touches is None else self._touches.encoded_touches()
         self._group.recorder.send(CloseFile(outcome_record, packed_touches, segment_ticks))
         # A disk may stall for as long at the end of a record as during the record.
-        stall_s = self._order.profile.limits.recorder_lag_s
-        closed_reply = self._await_recorder(FileClosed, stall_s + 2 * _REPLY_TIMEOUT_S)
+        max_recorder_lag_s = self._order.profile.limits.recorder_lag_s
+        closed_reply = self._await_recorder(FileClosed, max_recorder_lag_s + 2 * _REPLY_TIMEOUT_S)
         # The recorder's counts take precedence over those of the control process.
-        tick_counts = {**_ZERO_COUNTS, **finished.counts, **closed_reply.counts}
-        outcome_text, end_reason = finished.outcome, outcome_record["reason"]
+        tick_counts = {**_ZERO_COUNTS, **finished_message.counts, **closed_reply.counts}
+        outcome_text, end_reason = finished_message.outcome, outcome_record["reason"]
         if closed_reply.path is not None:
             outcome_text, end_reason = closed_reply.outcome, closed_reply.reason
         return SessionResult(
@@ -614,12 +621,12 @@ class SessionSupervisor:
             lost=tick_counts.get("lost", 0),
             stale_angles=tick_counts["stale_angles"],
             stale_wrenches=tick_counts["stale_wrenches"],
-            fault=finished.fault
+            fault=finished_message.fault
             or outcome_text == "fault"
             or (self._fit is not None and bool(self._fit.search_failure)),
             live_dropped=self._shared_state[StateField.LIVE_SAMPLES_DROPPED],
             touches=None if touch_documents is None else tuple(touch_documents),
-            fit=fit,
+            fit=fit_document,
         )
 
 

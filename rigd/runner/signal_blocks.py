@@ -129,10 +129,10 @@ class SignalBlockReader:
         self._cooled_torque_nm(sample_array.size / self._rate_hz)
         return self._gauges.take(sample_array)
 
-    def _read_blocks(self, observer: RingObserver, end: int) -> Iterator[SignalBlock]:
-        """Yield the unread samples before position `end` of the ring buffer in blocks."""
-        while observer.next_index < end:
-            ring_bytes = observer.take(min(_MAX_BLOCK_TICKS, end - observer.next_index))
+    def _read_blocks(self, observer: RingObserver, end_index: int) -> Iterator[SignalBlock]:
+        """Yield the unread samples before position `end_index` of the ring buffer in blocks."""
+        while observer.next_index < end_index:
+            ring_bytes = observer.take(min(_MAX_BLOCK_TICKS, end_index - observer.next_index))
             try:
                 sample_array = decode_samples(ring_bytes)
             except ValueError:
@@ -165,13 +165,14 @@ class SignalBlockReader:
         t_ns = int(sample_array["t_ns"][0]) - round((int(ticks[0]) - first_tick) * self._period_ns)
         return SignalBlock(first_tick, t_ns, signals)
 
-    def _cooled_torque_nm(self, covered_s: float) -> float:
+    def _cooled_torque_nm(self, sampled_duration_s: float) -> float:
         """Return the motor's rms torque (i²t) after it has cooled while there were no samples.
 
-        `covered_s` is the part of the time since the last call for which there are samples.
+        `sampled_duration_s` is the part of the time since the last call for which there are
+        samples.
         """
         now_s = time.monotonic()
         # Under the virtual clock a record is longer than the elapsed time.
-        uncovered_s = max(0.0, now_s - self._last_cooling_s - covered_s)
+        unsampled_duration_s = max(0.0, now_s - self._last_cooling_s - sampled_duration_s)
         self._last_cooling_s = now_s
-        return self._gauges.cool(uncovered_s)
+        return self._gauges.cool(unsampled_duration_s)

@@ -99,8 +99,8 @@ class SignalStatisticsReader:
         )
         self._peaks = np.maximum(self._peaks, [np.abs(signal).max() for signal in signals])
         self._recent_samples.append(samples)
-        oldest_ns = int(samples["t_ns"][-1]) - round(_STATISTICS_WINDOW_S * 1e9)
-        while self._recent_samples[0]["t_ns"][-1] < oldest_ns:
+        window_begin_ns = int(samples["t_ns"][-1]) - round(_STATISTICS_WINDOW_S * 1e9)
+        while self._recent_samples[0]["t_ns"][-1] < window_begin_ns:
             self._recent_samples.popleft()
 
 
@@ -111,11 +111,11 @@ def _signal_statistics(
     window_samples = np.concatenate(sample_blocks)
     last_sample = window_samples[-1]
     tick_span = int(last_sample["tick"]) - int(window_samples["tick"][0]) + 1
-    latency_us = 1e-3 * np.percentile(window_samples["lateness_ns"], (50, 99))
+    latency_percentiles_us = 1e-3 * np.percentile(window_samples["lateness_ns"], (50, 99))
     return SignalStatus(
         rate_hz=rate_hz * window_samples.size / tick_span,
-        lateness_p50_us=float(latency_us[0]),
-        lateness_p99_us=float(latency_us[1]),
+        lateness_p50_us=float(latency_percentiles_us[0]),
+        lateness_p99_us=float(latency_percentiles_us[1]),
         work_p99_us=float(1e-3 * np.percentile(window_samples["work_ns"], 99)),
         tracking_error_rad=float(last_sample["angle_reference_rad"] - last_sample["angle_rad"]),
         peak_tracking_error_rad=float(peaks[0]),
@@ -214,7 +214,7 @@ class StatusReader:
     def read(self, group: ProcessGroup) -> RigStatus:
         """Return the present status of the rig that these processes operate."""
         shared_state = group.channels.shared_state
-        load_ppm = shared_state.known_value(StateField.BUS_LOAD_PPM)
+        bus_load_ppm = shared_state.known_value(StateField.BUS_LOAD_PPM)
         return RigStatus(
             phase=Phase(shared_state[StateField.PHASE]),
             activity=activity(shared_state),
@@ -225,7 +225,7 @@ class StatusReader:
             missed=shared_state[StateField.MISSED_TICKS],
             late=shared_state[StateField.LATE_TICKS],
             lost=shared_state[StateField.LOST_SAMPLES],
-            bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
+            bus_load_percent=None if bus_load_ppm is None else bus_load_ppm * 1e-4,
             bus_errors=shared_state.known_value(StateField.BUS_ERRORS),
             sensor_status=shared_state.known_value(StateField.SENSOR_STATUS),
             disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
@@ -261,9 +261,9 @@ class StatusReader:
         shared_state, now_s = group.channels.shared_state, time.monotonic()
         for process in PROCESSES:
             assert process.beat is not None
-            silent_s = self._heartbeats[process].stalled_for(shared_state[process.beat], now_s)
+            silence_s = self._heartbeats[process].stalled_for(shared_state[process.beat], now_s)
             if process is SUPERVISOR:
-                yield ProcessStatus(process.name, os.getpid(), "running", silent_s)
+                yield ProcessStatus(process.name, os.getpid(), "running", silence_s)
                 continue
             if process not in group:
                 continue
@@ -272,8 +272,8 @@ class StatusReader:
                 process_state = "ended"
             elif not group.has_job(process):
                 process_state = "waiting"
-            elif process.max_silence_s is not None and silent_s > process.max_silence_s:
+            elif process.max_silence_s is not None and silence_s > process.max_silence_s:
                 process_state = "hung"
             else:
                 process_state = "running"
-            yield ProcessStatus(process.name, child_process.pid, process_state, silent_s)
+            yield ProcessStatus(process.name, child_process.pid, process_state, silence_s)

@@ -63,11 +63,11 @@ def test_the_move_is_planned_for_the_beam_of_the_analysis(analysed, profile):
 )
 def test_impossible_move_is_refused(profile, options, message):
     with pytest.raises(ExcitationError, match=message):
-        excitation_for(profile, "move", options, start_rad=0.2)
+        excitation_for(profile, "move", options, start_angle_rad=0.2)
 
 
 def test_move_starts_at_the_current_angle(profile):
-    made = excitation_for(profile, "move", {"by_rad": -0.4}, start_rad=1.2)
+    made = excitation_for(profile, "move", {"by_rad": -0.4}, start_angle_rad=1.2)
     assert made.stays
     assert made.kind == "move"
     assert KINDS["move"] is move
@@ -82,7 +82,7 @@ def test_move_starts_at_the_current_angle(profile):
 
 
 def test_move_runs_once(profile, tmp_path):
-    made = excitation_for(profile, "move", {"by_rad": -0.4}, start_rad=1.2)
+    made = excitation_for(profile, "move", {"by_rad": -0.4}, start_angle_rad=1.2)
     with pytest.raises(RefusedError, match="--repeat 2"):
         Series(profile, made, tmp_path, session_count=2)
 
@@ -223,4 +223,4 @@ def test_quiet_sensor_shows_vibration_by_friction(profile):
 )
 def test_impossible_search_for_obstacles_is_refused(profile, options, message):
     with pytest.raises(ExcitationError, match=message):
-        excitation_for(profile, "touch", options, start_rad=0.2)
+        excitation_for(profile, "touch", options, start_angle_rad=0.2)

@@ -59,7 +59,7 @@ def run(rig, order):
     def run(name: str, duration_s: float = 1.0, meanwhile=lambda progress: None, stop=None):
         session_order = order(name, duration_s)
         stop = stop or StopRequest()
-        messages = [rig.show(session_order, stop)]
+        messages = [rig.show_session(session_order, stop)]
 
         def watch(progress, events) -> None:
             messages.extend(event.message for event in events)
@@ -84,7 +84,7 @@ def test_view_of_a_series_is_complete_and_restarted(rig, run, save):
     os.kill(view.pid, signal.SIGKILL)
 
     def replaced() -> bool:
-        rig.watch()
+        rig.check_control_process()
         return rig.status().live_view.pid != view.pid
 
     assert eventually(replaced)
@@ -110,7 +110,7 @@ def test_counts_of_a_session_are_not_shown_in_the_next(rig, run, order):
     run("first")
     shared_state = rig._group.channels.shared_state
     assert shared_state[StateField.RECORD_MAY_START]
-    rig.show(order("second"), StopRequest())
+    rig.show_session(order("second"), StopRequest())
     assert shared_state[StateField.RECORD_MAY_START] == 0
 
 
@@ -229,5 +229,5 @@ def test_stop_is_not_delayed_by_a_missing_view(order):
 
     group.on_poll = poll
     view = live_view.LiveViewClient(group, "rig")
-    assert view.show(order("held up"), stop).startswith("The live view is still starting")
+    assert view.show_session(order("held up"), stop).startswith("The live view is still starting")
     assert len(polls) == 4  # once more for what it shows

@@ -45,10 +45,14 @@ class SearchBench:
 
     def plan(self, relative_std, held=0, before=None, **more):
         document = answer(self.profile, self.search.due_tick + held, relative_std, **more)
-        return list(self.search.plan_next(document, held, held if before is None else before))
+        return list(
+            self.search.plan_next_segment(document, held, held if before is None else before)
+        )
 
     def problem(self, text="Nothing is excited yet."):
-        return list(self.search.plan_next({"tick": self.search.due_tick, "problem": text}, 0, 0))
+        return list(
+            self.search.plan_next_segment({"tick": self.search.due_tick, "problem": text}, 0, 0)
+        )
 
 
 def test_a_search_may_state_the_uniformity_of_the_beam():
@@ -122,7 +126,7 @@ def test_two_amplitudes_distinguish_air_drag_from_damping(bench, monkeypatch):
 
 def test_ratio_of_a_value_below_its_uncertainty(profile):
     [estimate] = target_estimates(answer(profile, 0, 50.0), [parse_target("damping", "1:10%")])
-    assert estimate.ratio == pytest.approx(10.0)
+    assert estimate.std_ratio == pytest.approx(10.0)
 
 
 def test_certain_estimate_is_confirmed_with_all_structures(bench, monkeypatch):
@@ -188,7 +192,7 @@ def test_search_gives_up_on_a_doubtful_record(bench):
 def test_held_ticks_shift_the_next_segments(bench, insufficient_segments):
     bench.plan(ON_THE_WAY)
     bench.plan(ON_THE_WAY, held=300)
-    end = bench.search.end_of_record(9000, 300, bench.writer.ticks)
+    end = bench.search.record_end_message(9000, 300, bench.writer.ticks)
     first, last = end.segments["piece_1"]
     assert first == 6800
     assert last > first
@@ -199,7 +203,7 @@ def test_ticks_held_after_a_segment_do_not_shift_it(bench, insufficient_segments
     """As if a decision takes longer than the planned segment: the scan began at once."""
     bench.plan(ON_THE_WAY, held=1200, before=0)
     bench.plan(ON_THE_WAY, held=2000, before=1700)
-    segments = bench.search.end_of_record(14000, 2050, bench.writer.ticks).segments
+    segments = bench.search.record_end_message(14000, 2050, bench.writer.ticks).segments
     assert segments["scan"] == (1000, 6000)
     assert segments["sweep"][0] == 1000
     first, end = segments["piece_1"]
@@ -213,7 +217,7 @@ def test_planned_segment_without_a_start_is_omitted(bench, insufficient_segments
     due_tick = bench.search.due_tick
     assert bench.search.has_last_segment_begun(bench.writer.ticks)
     assert not bench.search.has_last_segment_begun(0)
-    segments = bench.search.end_of_record(due_tick + 400, 0, 0).segments
+    segments = bench.search.record_end_message(due_tick + 400, 0, 0).segments
     assert segments.keys() == {"scan", "sweep"}
 
 
@@ -284,14 +288,14 @@ def test_absent_damping_is_out_of_reach(profile, monkeypatch):
         document["plant"]["damping"] |= {"zeta": 0.0}
         document["covariance"]["names"].remove("zeta")
         document["parameters"] = {}
-        found = bench.search.plan_next(document, 0, 0)
+        found = bench.search.plan_next_segment(document, 0, 0)
         ends = [m for m in found if isinstance(m, SearchEnded)]
     assert ends[0].reason.startswith("Out of reach: internal damping is absent")
 
 
 def test_absent_mode_has_no_estimate(profile):
     (found,) = target_estimates(answer(profile, 1, CERTAIN), [parse_target("damping", "7:1%")])
-    assert found.ratio == np.inf
+    assert found.std_ratio == np.inf
     assert estimates_text([found]) == "damping of mode 7: no such mode was found in the band"
     none = answer(profile, 1, CERTAIN) | {"modes": []}
     (found,) = target_estimates(none, [parse_target("frequency", "1%")])
@@ -306,7 +310,7 @@ def test_flagged_target_is_never_reached(profile, sufficient_segments):
         document = answer(profile, bench.search.due_tick, CERTAIN)
         damping = document["modes"][1]["damping_ratio"]
         damping["flag"] = "part of the record is unexplained"
-        messages = list(bench.search.plan_next(document, 0, 0))
+        messages = list(bench.search.plan_next_segment(document, 0, 0))
         ends = [m for m in messages if isinstance(m, SearchEnded)]
     assert not ends[0].reached
     assert "damping of mode 2: part of the record is unexplained" in ends[0].reason
@@ -317,7 +321,7 @@ def test_excitation_of_modes_of_a_nonuniform_beam(profile):
     bench = SearchBench(profile, "damping 2:0.1%", at_most_s=40.0)
     document = answer(profile, bench.search.due_tick, ON_THE_WAY)
     document["plant"]["stiffness_offsets"] = [0.04, 0.0]
-    *_, segment = bench.search.plan_next(document, 0, 0)
+    *_, segment = bench.search.plan_next_segment(document, 0, 0)
     bands_hz = [
         (float(low) + float(high)) / 2
         for low, high in re.findall(r"([\d.]+)–([\d.]+)", segment.name)
@@ -375,4 +379,4 @@ def test_absolute_and_relative_targets(profile):
     names = [(each["name"], each["quantity"], each["mode"]) for each in targets_json(found)]
     assert names == [("frequency of mode 1", "frequency", 1), ("damping of mode 2", "damping", 2)]
     assert frequency.target_std == 0.002
-    assert damping.ratio == pytest.approx(2.0)
+    assert damping.std_ratio == pytest.approx(2.0)

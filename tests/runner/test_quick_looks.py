@@ -84,7 +84,7 @@ def test_quick_looks_run_one_after_the_other(queue, tmp_path, started):
         queue.begin(path)
         assert len(started()) == 1
     first, second = await_results(queue)
-    assert [first.session, second.session] == paths
+    assert [first.session_path, second.session_path] == paths
     assert first.path == quick_look_path(paths[0])
     assert first.lines == ["Look at a"]
     assert first.error == ""
@@ -101,7 +101,7 @@ def test_quick_looks_run_one_after_the_other(queue, tmp_path, started):
 def test_failed_quick_look_states_its_reason(queue, tmp_path, name, error):
     queue.begin(tmp_path / f"{name}.mcap")
     (result,) = await_results(queue)
-    assert (result.path, result.content) == (None, None)
+    assert (result.path, result.report_content) == (None, None)
     assert result.error.endswith(error)
     assert result.lines == [f"No quick look at {name}.mcap: {result.error}"]
 
@@ -118,7 +118,7 @@ def test_no_quick_look_runs_during_a_session(queue, tmp_path, started):
         assert started() == [pid]
         assert state_of(Path(f"/proc/{pid}")) == "T"
         assert queue.results == []
-    assert [each.session.stem for each in await_results(queue)] == ["waits", "next"]
+    assert [each.session_path.stem for each in await_results(queue)] == ["waits", "next"]
 
 
 def test_hanging_quick_look_is_killed_except_for_session_time(queue, tmp_path, monkeypatch):
@@ -187,12 +187,12 @@ def test_oldest_of_too_many_quick_looks_are_skipped(queue, tmp_path):
     names = ("waits", "a", "b", "c", "d", "e")
     for name in names:
         queue.begin(tmp_path / f"{name}.mcap")
-    assert [(each.session.stem, each.error) for each in queue.results] == [
+    assert [(each.session_path.stem, each.error) for each in queue.results] == [
         ("a", "skipped in favour of later sessions."),
         ("b", "skipped in favour of later sessions."),
     ]
     (tmp_path / "waits.go").touch()
-    assert [each.session.stem for each in await_results(queue)] == [
+    assert [each.session_path.stem for each in await_results(queue)] == [
         "a",
         "b",
         "waits",

@@ -112,13 +112,13 @@ def test_zero_is_lost_with_the_connection(rig, run):
 
 
 def test_death_of_the_control_process_is_noticed(rig):
-    rig.watch()
+    rig.check_control_process()
     (control,) = (p for p in rig.status().processes if p.name == "control")
     os.kill(control.pid, signal.SIGKILL)
     deadline = time.monotonic() + 10.0
     with pytest.raises(RigError, match="killed by signal 9"):
         while time.monotonic() < deadline:
-            rig.watch()
+            rig.check_control_process()
             time.sleep(0.01)
     assert not rig.connected
 

@@ -29,7 +29,7 @@ class Rig:
         self.results = list(results)
         self.orders = []
 
-    def show(self, order, stop):
+    def show_session(self, order, stop):
         return "Live view: there"
 
     def run(self, order, stop, listener, listens):
@@ -162,7 +162,7 @@ def test_quick_look_is_suspended_during_a_session(make_series):
     listener = RecordingListener()
 
     class WatchedRig(Rig):
-        def watch(self):
+        def check_control_process(self):
             listener.calls.append("watch")
 
         def run(self, *order):
@@ -193,7 +193,7 @@ def test_stop_ends_the_wait_for_a_quick_look(make_series):
     listener, stop = RecordingListener(), StopRequest()
 
     class StoppingRig(Rig):
-        def watch(self):
+        def check_control_process(self):
             listener.calls.append("watch")
             stop.request()
 
@@ -261,7 +261,7 @@ def test_progress_redraws_the_line_a_few_times_a_second(monkeypatch):
         patched.setattr(line._has_changed, "set", lambda: drawn.append(now_s))
         for tick in range(1000):
             now_s = tick / 1000
-            line.update(Phase.RUNNING, tick, 1000, missed=0, late=0)
+            line.update(Phase.RUNNING, tick, 1000, missed_ticks=0, late_ticks=0)
         assert 15 <= len(drawn) <= 21
         line.write_message("at once")
         assert drawn[-1] == now_s

@@ -105,7 +105,7 @@ def test_a_rig_may_be_idle_between_sessions(quiet_profile, start_simulator, load
     def leave_alone(duration_s):
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s:
-            rig.watch()
+            rig.check_control_process()
             time.sleep(0.2)
 
     try:
