@@ -31,7 +31,7 @@ _QUICK_LOOK_MAX_RUN_TIME_S: Final = 10.0
 it waits for the processor."""
 _QUICK_LOOK_MAX_WAIT_S: Final = 120.0
 """Maximum time in seconds to wait for the last quick look, whatever time it has run."""
-_POLL_S: Final = 0.05
+_POLL_INTERVAL_S: Final = 0.05
 
 _PrintLine = Callable[[str], None]
 """Function that prints a line for the operator."""
@@ -291,7 +291,7 @@ def _await_quick_looks(quick_looks: QuickLookQueue, stop: StopRequest) -> None:
         and quick_looks.run_time_s < _QUICK_LOOK_MAX_RUN_TIME_S
         and time.monotonic() < deadline_s
     ):
-        time.sleep(_POLL_S)
+        time.sleep(_POLL_INTERVAL_S)
         quick_looks.poll()
     if quick_looks.busy and not is_skipped:
         skip_reason = (

@@ -41,7 +41,7 @@ from rigd.runner.signal_blocks import SignalBlock, SignalBlockReader
 from rigd.runner.status import RigStatus, StatusReader
 from rigd.runtime import StopRequest
 
-_POLL_S = 0.05
+_POLL_INTERVAL_S = 0.05
 """Time in seconds between two checks for a message of the control process."""
 _CONNECT_TIMEOUT_S = 30.0
 """Maximum time in seconds for connecting the devices."""
@@ -363,7 +363,7 @@ class Rig:
         )
         deadline_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_TIMEOUT_S
         while True:
-            probe_reply = group.control.poll(_POLL_S)
+            probe_reply = group.control.poll(_POLL_INTERVAL_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
             if isinstance(probe_reply, ControlEnded):
                 raise RigError(probe_reply.reason or "It was stopped.")

@@ -29,7 +29,7 @@ from rigd.runtime import StopRequest
 _QUICK_LOOK_MAX_PAUSE_S: Final = 8.0
 """Maximum time in seconds that the next session waits for the quick look at the previous one, which
 mostly takes two or three. An unfinished quick look is then suspended."""
-_POLL_S: Final = 0.05
+_POLL_INTERVAL_S: Final = 0.05
 
 
 class SeriesListener(Protocol):
@@ -242,12 +242,12 @@ class Series:
             if not run_result.is_successful:
                 return
 
-    def _session_seed(self, number: int) -> int | None:
+    def _session_seed(self, session_number: int) -> int | None:
         """Return the seed of the simulated rig's noise in a session, or None for a random seed."""
         simulation = self._profile.rig.simulation
         if simulation is None or simulation.seed is None:
             return None
-        return session_seed(simulation.seed, number)
+        return session_seed(simulation.seed, session_number)
 
     def _probe_if_needed(
         self, rig: Rig, stop: StopRequest, listener: SeriesListener
@@ -276,4 +276,4 @@ def _await_quick_look(quick_looks: QuickLookQueue, rig: Rig, stop: StopRequest) 
     while quick_looks.busy and not stop.requested and time.monotonic() < deadline_s:
         rig.check_control_process()
         quick_looks.poll()
-        time.sleep(_POLL_S)
+        time.sleep(_POLL_INTERVAL_S)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rigd.engine.workers import Worker
     from rigd.runner._process_group import ProcessGroup
 
-_POLL_S: Final = 0.05
+_POLL_INTERVAL_S: Final = 0.05
 """Maximum time in seconds of a single wait for a message."""
 
 
@@ -120,7 +120,7 @@ class WorkerClient(ABC):
         """
         deadline_s = time.monotonic() + timeout_s
         while not (is_condition_met() or self.failure):
-            self.process_messages(_POLL_S)
+            self.process_messages(_POLL_INTERVAL_S)
             if call_while_waiting() is False:
                 break
             if time.monotonic() > deadline_s:

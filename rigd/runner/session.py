@@ -40,7 +40,7 @@ from rigd.runner._touch_search import TouchClient
 from rigd.runner.request import SessionOrder, file_header, next_free_path, part_path
 from rigd.runtime import StopRequest
 
-_POLL_S = 0.02
+_POLL_INTERVAL_S = 0.02
 """Time in seconds between two checks of the other processes for messages and heartbeats."""
 _REPLY_TIMEOUT_S = 5.0
 """Maximum time in seconds for a reply of the recorder, and for the control process to stop."""
@@ -404,9 +404,11 @@ class SessionSupervisor:
         deadline_s, last_phase = 0.0, -1
         while True:
             # An estimate of a touch is more urgent than a message from the control process.
-            has_waited = self._touches is not None and self._touches.process_messages(_POLL_S)
+            has_waited = self._touches is not None and self._touches.process_messages(
+                _POLL_INTERVAL_S
+            )
             try:
-                control_message = self._group.control.poll(0.0 if has_waited else _POLL_S)
+                control_message = self._group.control.poll(0.0 if has_waited else _POLL_INTERVAL_S)
             except ChildError as error:
                 return self._control_died(f"{error} {WITHOUT_HEARTBEAT_TEXT}")
             self._report_progress()
@@ -521,7 +523,7 @@ class SessionSupervisor:
         deadline_s = time.monotonic() + timeout_s
         recorder_message = None
         while recorder_message is None and time.monotonic() < deadline_s:
-            recorder_message = self._group.recorder.poll(_POLL_S)
+            recorder_message = self._group.recorder.poll(_POLL_INTERVAL_S)
             self._report_progress()
         if recorder_message is None:
             raise SessionFailedError(

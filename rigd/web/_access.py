@@ -40,7 +40,7 @@ _FIRST_REQUEST_TIMEOUT_S: Final = 10.0
 """Timeout in seconds for the first request of a connection."""
 _POLL_PERIOD_S: Final = 0.5
 """Interval in seconds at which silent connections are closed."""
-_MAX_CONNECTIONS: Final = 96
+_MAX_OPEN_CONNECTIONS: Final = 96
 """Largest number of connections; beyond it the oldest ones without an open page are closed."""
 
 _PAGE_POLICY: Final = "; ".join(  # Content security policy of the page
@@ -119,10 +119,8 @@ class WebAccess:
         """
         if self.may_act(request):
             return True
-        reads_a_file = (
-            command == "predict" and isinstance(parameters, dict) and "path" in parameters
-        )
-        return command in _COMMANDS_WITHOUT_TOKEN and not reads_a_file
+        reads_file = command == "predict" and isinstance(parameters, dict) and "path" in parameters
+        return command in _COMMANDS_WITHOUT_TOKEN and not reads_file
 
 
 async def read_json_object(request: web.Request) -> dict[str, Any]:
@@ -226,7 +224,7 @@ class Connections:
             for handler in self.http_server.connections
             if handler.transport is not None and not handler.transport.is_closing()
         ]
-        excess_count = max(0, len(open_connections) - _MAX_CONNECTIONS + 1)
+        excess_count = max(0, len(open_connections) - _MAX_OPEN_CONNECTIONS + 1)
         # The newest client may want to stop the rig.
         for old_transport in [
             handler[1] for handler in open_connections if handler[0] not in self._pages

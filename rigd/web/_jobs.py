@@ -37,7 +37,7 @@ class AnalysisJob:
 
     number: int
     """Number of the job, from 1."""
-    kind: str
+    job_kind: str
     """Kind of the job: ``report``, ``campaign`` or ``export``."""
     arguments: Sequence[str]
     """Arguments of `analyze`."""
@@ -49,17 +49,17 @@ class AnalysisJob:
     """State of the job: ``waiting``, ``running``, ``done`` or ``failed``."""
     error: str = ""
     """Message for the operator if the job failed."""
-    dropped: bool = False
+    is_dropped: bool = False
     """Whether the job was dropped because a session has begun."""
-    done: asyncio.Event = field(default_factory=asyncio.Event)
+    end_event: asyncio.Event = field(default_factory=asyncio.Event)
     """Event that is set when the job has ended."""
 
-    def document(self) -> Document:
+    def as_document(self) -> Document:
         """Return the state of the job as a message to the open pages."""
         return {
             "type": "job",
             "number": self.number,
-            "kind": self.kind,
+            "kind": self.job_kind,
             "id": self.session_name,
             "state": self.state,
             "error": self.error,
@@ -87,15 +87,19 @@ class Jobs:
         """URL paths of the results of waiting and running jobs."""
         return {job.result_url for job in self._unfinished.values()}
 
-    def put(
-        self, kind: str, arguments: Sequence[str], session_name: str = "", result_url: str = ""
+    def add_job(
+        self,
+        job_kind: str,
+        analyze_arguments: Sequence[str],
+        session_name: str = "",
+        result_url: str = "",
     ) -> AnalysisJob:
         """Queue a run of the program `analyze`, and return it as a job.
 
         Arguments are as in `AnalysisJob`. Raise `JobError` if too many jobs are waiting.
         """
         self._count += 1
-        job = AnalysisJob(self._count, kind, arguments, session_name, result_url)
+        job = AnalysisJob(self._count, job_kind, analyze_arguments, session_name, result_url)
         try:
             self._queue.put_nowait(job)
         except asyncio.QueueFull:
@@ -105,14 +109,14 @@ class Jobs:
         return job
 
     async def await_or_drop(self, job: AnalysisJob) -> None:
-        """Wait for the end of a job; if a session begins, drop the job and set its ``dropped``."""
-        while not job.done.is_set():
+        """Wait for the end of a job; if a session begins, drop the job and set `is_dropped`."""
+        while not job.end_event.is_set():
             if self.paused:
-                job.dropped = True
+                job.is_dropped = True
                 if job.state == "waiting":
                     return
             with suppress(TimeoutError):
-                await asyncio.wait_for(job.done.wait(), _POLL_PERIOD_S)
+                await asyncio.wait_for(job.end_event.wait(), _POLL_PERIOD_S)
 
     async def run(self) -> None:
         """Run the queued jobs one after the other until this task is cancelled."""
@@ -120,7 +124,7 @@ class Jobs:
             job = await self._queue.get()
             while self.paused:
                 await asyncio.sleep(_POLL_PERIOD_S)
-            if not job.dropped:
+            if not job.is_dropped:
                 job.state = "running"
                 self._publish_state(job)
                 try:
@@ -128,31 +132,31 @@ class Jobs:
                     job.state = "done"
                 except (JobError, ChildError) as error:
                     job.state, job.error = "failed", str(error)
-                job.done.set()
+                job.end_event.set()
                 self._publish_state(job)
             del self._unfinished[job.number]
 
     def _publish_state(self, job: AnalysisJob) -> None:
         """Send a job's state to the open pages, unless the job exports a session for a download."""
-        if job.kind != "export":
-            self._publish(job.document())
+        if job.job_kind != "export":
+            self._publish(job.as_document())
 
     async def _run_process(self, job: AnalysisJob) -> None:
         """Run a job's process to its end, or raise JobError if it is dropped or fails."""
-        child = ChildProcess(REPORT, *job.arguments, folder=self._folder)
-        is_suspended = False
+        child_process = ChildProcess(REPORT, *job.arguments, folder=self._folder)
+        is_process_suspended = False
         try:
-            while child.running:
-                if job.dropped:
+            while child_process.running:
+                if job.is_dropped:
                     raise JobError("A session has begun.")
-                if self.paused is not is_suspended:
-                    is_suspended = self.paused
-                    (child.suspend if is_suspended else child.resume)()
+                if self.paused is not is_process_suspended:
+                    is_process_suspended = self.paused
+                    (child_process.suspend if is_process_suspended else child_process.resume)()
                 await asyncio.sleep(_RUNNING_POLL_PERIOD_S)
-            error_text = child.error_text()
+            error_text = child_process.error_text()
         finally:
-            await asyncio.to_thread(child.stop)
-        if child.exit_code != 0:
-            last_lines = error_text[-_MAX_STDERR_BYTES:].splitlines()[-_MAX_STDERR_LINES:]
-            failure_reason = " ".join(last_lines) or f"exit code {child.exit_code}"
-            raise JobError(f"The {job.kind} was not made: {failure_reason}")
+            await asyncio.to_thread(child_process.stop)
+        if child_process.exit_code != 0:
+            last_error_lines = error_text[-_MAX_STDERR_BYTES:].splitlines()[-_MAX_STDERR_LINES:]
+            failure_reason = " ".join(last_error_lines) or f"exit code {child_process.exit_code}"
+            raise JobError(f"The {job.job_kind} was not made: {failure_reason}")

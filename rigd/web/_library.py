@@ -21,15 +21,15 @@ from rigd.web._jobs import JobError, Jobs
 
 Document = dict[str, Any]
 
-_MAX_ROWS: Final = 1000
+_MAX_ROW_LIMIT: Final = 1000
 """Largest number of sessions in one reply."""
-_DEFAULT_ROWS: Final = 50
+_DEFAULT_ROW_LIMIT: Final = 50
 """Default number of sessions in one reply."""
 _MAX_CAMPAIGN_SESSIONS: Final = 100
 """Largest number of sessions in a campaign."""
-_MAX_RESPONSES: Final = 12
+_MAX_COMPARED_RESPONSES: Final = 12
 """Largest number of frequency responses in one reply."""
-_FILTERS: Final = ("specimen", "operator", "excitation", "outcome", "since", "until", "text")
+_FILTER_NAMES: Final = ("specimen", "operator", "excitation", "outcome", "since", "until", "text")
 """Query parameters that filter the list of sessions."""
 _EXPORT_SUFFIXES: Final = {"mat": ".mat", "uff": ".uff"}
 """Suffixes of files that sessions can be converted into, by the end of the URL."""
@@ -68,14 +68,16 @@ class Library:
             web.get("/api/frf", self._send_responses),
         ]
 
-    async def rows(self, **filters: Any) -> list[SessionRow]:  # noqa: ANN401 - the library's
+    async def matching_rows(self, **filters: Any) -> list[SessionRow]:  # noqa: ANN401 - the library's
         """Return the sessions that pass filters as of `list_sessions`, the newest first."""
         async with self._list_lock:
             return await asyncio.to_thread(list_sessions, self._folder, **filters)
 
     async def specimens(self) -> list[str]:
         """Return the names of the specimens of all sessions, the most recent first."""
-        return list(dict.fromkeys(row.specimen for row in await self.rows() if row.specimen))
+        return list(
+            dict.fromkeys(row.specimen for row in await self.matching_rows() if row.specimen)
+        )
 
     async def last_response(self, specimen: str, excluded_session: str) -> Document | None:
         """Return the message with the frequency response of a specimen's last session, or None.
@@ -104,15 +106,15 @@ class Library:
         """Reply with a part of the filtered list of recorded sessions."""
         filters = {
             filter_name: filter_value
-            for filter_name in _FILTERS
+            for filter_name in _FILTER_NAMES
             if (filter_value := request.query.get(filter_name))
         }
         row_limit, first_row = (
             _whole_number(request.query.get(filter_name, str(default_number)), filter_name)
-            for filter_name, default_number in (("limit", _DEFAULT_ROWS), ("offset", 0))
+            for filter_name, default_number in (("limit", _DEFAULT_ROW_LIMIT), ("offset", 0))
         )
-        session_rows = await self.rows(**filters)
-        shown_rows = session_rows[first_row : first_row + min(row_limit, _MAX_ROWS)]
+        session_rows = await self.matching_rows(**filters)
+        shown_rows = session_rows[first_row : first_row + min(row_limit, _MAX_ROW_LIMIT)]
         return web.json_response(
             {"total": len(session_rows), "sessions": [row.as_dict() for row in shown_rows]}
         )
@@ -128,13 +130,13 @@ class Library:
 
     async def _send_responses(self, request: web.Request) -> web.Response:
         """Send fitted models and measured responses of several sessions for comparison."""
-        session_ids = [
+        session_names = [
             session_name for session_name in request.query.get("ids", "").split(",") if session_name
         ]
-        if not 1 <= len(session_ids) <= _MAX_RESPONSES:
-            return refusal_response(400, f"ids: name 1 to {_MAX_RESPONSES} sessions.")
+        if not 1 <= len(session_names) <= _MAX_COMPARED_RESPONSES:
+            return refusal_response(400, f"ids: name 1 to {_MAX_COMPARED_RESPONSES} sessions.")
         responses, error_texts = [], []
-        for session_name in session_ids:
+        for session_name in session_names:
             quick_look = self._read_quick_look(self._session_path(session_name).stem)
             if quick_look is None or quick_look["response"] is None:
                 error_texts.append(
@@ -171,16 +173,16 @@ class Library:
                 export_path = (
                     Path(temporary_folder) / f"{session_path.stem}{_EXPORT_SUFFIXES[file_ending]}"
                 )
-                arguments = ("export", "record", str(session_path), str(export_path))
+                analyze_arguments = ("export", "record", str(session_path), str(export_path))
                 try:
-                    job = self._jobs.put("export", arguments, session_path.stem)
+                    export_job = self._jobs.add_job("export", analyze_arguments, session_path.stem)
                 except JobError as error:
                     return refusal_response(409, str(error))
-                await self._jobs.await_or_drop(job)
-                if job.dropped:
+                await self._jobs.await_or_drop(export_job)
+                if export_job.is_dropped:
                     return refusal_response(409, _SESSION_RUNS_MESSAGE)
-                if job.error:
-                    return refusal_response(409, job.error)
+                if export_job.error:
+                    return refusal_response(409, export_job.error)
                 # The open file can be sent after its folder is deleted.
                 return web.Response(
                     body=export_path.open("rb"), headers=_download_headers(export_path.name)
@@ -192,7 +194,7 @@ class Library:
         """Send one file of the analysis report of a session."""
         session_path = self._requested_session(request)
         session_row = next(
-            (row for row in await self.rows() if row.path.name == session_path.name), None
+            (row for row in await self.matching_rows() if row.path.name == session_path.name), None
         )
         if session_row is None or session_row.report is None:
             return refusal_response(404, "There is no report of it.")
@@ -232,26 +234,26 @@ class Library:
         if not self._access.may_act(request):
             return refusal_response(403, "A campaign needs the token of the printed address.")
         request_object = await read_json_object(request)
-        session_ids = request_object.get("ids")
+        session_names = request_object.get("ids")
         if (
-            not isinstance(session_ids, list)
-            or not 2 <= len(session_ids) <= _MAX_CAMPAIGN_SESSIONS
-            or not all(isinstance(session_name, str) for session_name in session_ids)
+            not isinstance(session_names, list)
+            or not 2 <= len(session_names) <= _MAX_CAMPAIGN_SESSIONS
+            or not all(isinstance(session_name, str) for session_name in session_names)
         ):
             return refusal_response(400, f"ids: name 2 to {_MAX_CAMPAIGN_SESSIONS} sessions.")
-        paths = sorted(
-            {str(self._session_path(session_name)) for session_name in session_ids}
+        session_paths = sorted(
+            {str(self._session_path(session_name)) for session_name in session_names}
         )  # in the order of recording
         report_folder = self._unused_folder("campaign.report")
-        arguments = [*paths, "--jobs", "1", "--report", str(report_folder)]
-        return self._queue_job("campaign", arguments, "", _campaign_url_path(report_folder))
+        analyze_arguments = [*session_paths, "--jobs", "1", "--report", str(report_folder)]
+        return self._queue_job("campaign", analyze_arguments, "", _campaign_url_path(report_folder))
 
     def _queue_job(
-        self, job_kind: str, arguments: list[str], session_name: str, report_url: str
+        self, job_kind: str, analyze_arguments: list[str], session_name: str, report_url: str
     ) -> web.Response:
         """Queue a job, and return the HTTP response: its number, or a refusal."""
         try:
-            job = self._jobs.put(job_kind, arguments, session_name, report_url)
+            job = self._jobs.add_job(job_kind, analyze_arguments, session_name, report_url)
         except JobError as error:
             return refusal_response(409, str(error))
         return web.json_response({"ok": True, "job": job.number}, status=202)
@@ -321,6 +323,6 @@ def _download_headers(file_name: str) -> dict[str, str]:
 
 def _whole_number(parameter_text: str, parameter_name: str) -> int:
     """Return a URL's query parameter as a whole number, or raise HTTPBadRequest."""
-    if not parameter_text.isdecimal() or len(parameter_text) > len(str(_MAX_ROWS)) + 3:
+    if not parameter_text.isdecimal() or len(parameter_text) > len(str(_MAX_ROW_LIMIT)) + 3:
         raise web.HTTPBadRequest(reason=f"{parameter_name} is not a whole number.")
     return int(parameter_text)

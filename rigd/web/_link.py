@@ -28,7 +28,7 @@ _REPLY_TIMEOUT_S: Final = 90.0
 """Timeout in seconds for the daemon's reply to a request."""
 _MAX_LINE_BYTES: Final = 1 << 20
 """Largest size of a message of the daemon in bytes."""
-_CROWDED_ATTEMPTS: Final = 20
+_MAX_CROWDED_ATTEMPTS: Final = 20
 """Number of attempts to connect while the daemon has too many clients."""
 _CROWDED_PAUSE_S: Final = 0.1
 """Pause in seconds between attempts to connect while the daemon has too many clients."""
@@ -50,11 +50,14 @@ class DaemonLink:
     """
 
     def __init__(
-        self, path: Path, on_message: Callable[[Document], None], on_lost: Callable[[str], None]
+        self,
+        daemon_socket_path: Path,
+        on_message: Callable[[Document], None],
+        on_connection_lost: Callable[[str], None],
     ) -> None:
-        self._path = path
+        self._path = daemon_socket_path
         self._on_message = on_message
-        self._on_lost = on_lost
+        self._on_lost = on_connection_lost
         self._status_requested = asyncio.Event()
         self._control_connection: _Connection | None = None
         self._controlled_series: float = 0
@@ -127,7 +130,7 @@ class DaemonLink:
         The request is repeated while the daemon has too many clients.
         """
         stop_count = self._stop_count
-        for attempt_number in range(_CROWDED_ATTEMPTS):
+        for attempt_number in range(_MAX_CROWDED_ATTEMPTS):
             if attempt_number:
                 await asyncio.sleep(_CROWDED_PAUSE_S)
             try:
@@ -202,12 +205,12 @@ class DaemonLink:
             writer.write(b'{"command": "status"}\n')
             self._status_requested.clear()
             # Without signals only the status shows that the daemon is alive.
-            pause_s = (
+            status_period_s = (
                 _STATUS_PERIOD_S if self._signals_received else _STATUS_PERIOD_WITHOUT_SIGNALS_S
             )
             self._signals_received = False
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._status_requested.wait(), pause_s)
+                await asyncio.wait_for(self._status_requested.wait(), status_period_s)
 
     def _register_end(self, series_number: float) -> None:
         """Register the end of a series, and release the rig unless a request is pending."""

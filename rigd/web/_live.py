@@ -29,27 +29,29 @@ _STORED_LOG_LINES: Final = 200
 class OpenPage:
     """Connection to one open page, by a WebSocket ready for writing, with a queue of messages."""
 
-    def __init__(self, socket: web.WebSocketResponse, transport: asyncio.Transport | None) -> None:
-        self._socket = socket
+    def __init__(
+        self, web_socket: web.WebSocketResponse, transport: asyncio.Transport | None
+    ) -> None:
+        self._socket = web_socket
         self._transport = transport
         self._queue: deque[str] = deque()
         self._message_queued = asyncio.Event()
 
-    def put(self, message_text: str) -> None:
+    def queue_message(self, message_text: str) -> None:
         """Queue a message to the page, or close its connection if the queue is full."""
         if len(self._queue) >= _MAX_QUEUED_MESSAGES:
-            self.drop()
+            self.close_connection()
             return
         self._queue.append(message_text)
         self._message_queued.set()
 
-    def drop(self) -> None:
+    def close_connection(self) -> None:
         """Close the connection of the page at once."""
         self._queue.clear()
         if self._transport is not None:
             self._transport.abort()
 
-    async def write(self) -> None:
+    async def send_queued_messages(self) -> None:
         """Send the queued messages until cancelled or until the page has disconnected."""
         with suppress(ConnectionError, RuntimeError):
             while True:
@@ -62,13 +64,13 @@ class OpenPage:
                     await self._socket.send_str(message_text)
 
     async def stop_on_request(
-        self, stop_requested: asyncio.Event, stop: Callable[[], Awaitable[Document]]
+        self, stop_requested: asyncio.Event, stop_session: Callable[[], Awaitable[Document]]
     ) -> None:
         """Stop the session at each event `stop_requested`, and send the page the result."""
         while True:
             await stop_requested.wait()
             stop_requested.clear()
-            self.put(_to_json({"type": "stop", **await stop()}))
+            self.queue_message(_to_json({"type": "stop", **await stop_session()}))
 
 
 class Pages:
@@ -82,14 +84,14 @@ class Pages:
         """Return the number of open pages."""
         return len(self._pages)
 
-    def send(self, document: Document | None) -> None:
+    def send(self, message_document: Document | None) -> None:
         """Send a message to all open pages; None is ignored."""
-        if document is not None and self._pages:
-            message_text = _to_json(document)
+        if message_document is not None and self._pages:
+            message_text = _to_json(message_document)
             for open_page in list(self._pages):
-                open_page.put(message_text)
+                open_page.queue_message(message_text)
 
-    def log(self, level: str, log_text: str) -> None:
+    def log_message(self, level: str, log_text: str) -> None:
         """Send a line of the log to all open pages, and store it for pages that open later."""
         log_event = {"type": "event", "utc_ns": time.time_ns(), "level": level, "text": log_text}
         self._events.append(log_event)
@@ -99,12 +101,12 @@ class Pages:
         self,
         request: web.Request,
         first_messages: Iterable[Document],
-        stop: Callable[[], Awaitable[Document]],
+        stop_session: Callable[[], Awaitable[Document]],
     ) -> web.StreamResponse:
         """Send live messages to a new page until it is closed.
 
-        `stop`, which stops the session, is called for each message ``stop`` of the page; its result
-        is sent to the page.
+        `stop_session`, which stops the session, is called for each message ``stop`` of the page;
+        its result is sent to the page.
         """
         if len(self._pages) >= MAX_PAGES:
             raise web.HTTPServiceUnavailable(reason=f"There are {MAX_PAGES} open pages already.")
@@ -114,12 +116,12 @@ class Pages:
         await web_socket.prepare(request)
         open_page = OpenPage(web_socket, request.transport)
         for document in (*first_messages, *self._events):
-            open_page.put(_to_json(document))
+            open_page.queue_message(_to_json(document))
         self._pages.add(open_page)
         stop_requested = asyncio.Event()
         page_tasks = [
-            asyncio.create_task(open_page.write()),
-            asyncio.create_task(open_page.stop_on_request(stop_requested, stop)),
+            asyncio.create_task(open_page.send_queued_messages()),
+            asyncio.create_task(open_page.stop_on_request(stop_requested, stop_session)),
         ]
         try:
             # Unlike a request, this does not wait for downloads of the browser. Any other message
@@ -132,13 +134,13 @@ class Pages:
             self._pages.discard(open_page)
             for page_task in page_tasks:
                 page_task.cancel()
-            open_page.drop()
+            open_page.close_connection()
         return web_socket
 
-    def drop_all(self) -> None:
+    def close_all_connections(self) -> None:
         """Close the connections of all pages."""
         for open_page in list(self._pages):
-            open_page.drop()
+            open_page.close_connection()
 
 
 _to_json: Final = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode

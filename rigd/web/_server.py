@@ -39,11 +39,11 @@ from rigd.web._signals import PageSignalBlock, SessionResponse, SignalEnvelopes,
 
 Document = dict[str, Any]
 
-_LOOPBACK: Final = "127.0.0.1"
+_LOOPBACK_ADDRESS: Final = "127.0.0.1"
 """Address on which the page is served."""
-_COMMANDS: Final = frozenset({"start", "stop", "tare", "zero", "reset", "predict", "check"})
+_PAGE_COMMANDS: Final = frozenset({"start", "stop", "tare", "zero", "reset", "predict", "check"})
 """Commands that the page may send to the daemon."""
-_MAX_STOPS: Final = 4
+_MAX_SIMULTANEOUS_STOPS: Final = 4
 """Largest number of simultaneous stops; each has its own thread."""
 _MAX_REQUEST_BYTES: Final = 65_536
 """Largest size of a request's body in bytes."""
@@ -53,33 +53,33 @@ _LINGERING_TIME_S: Final = 1.0
 """Seconds for which the server reads what remains of a request before it disconnects."""
 _RESPONSE_PERIOD_S: Final = 1.0
 """Interval in seconds at which the frequency response of a running session is sent."""
-_LAST_MESSAGES_S: Final = 0.3
+_LAST_MESSAGES_TIMEOUT_S: Final = 0.3
 """Seconds for the last messages to reach the pages before the process ends."""
 _SESSION_STATES: Final = ("running", "stopping")
 """States of the daemon in which a session runs."""
 _FAILED_MESSAGE: Final = "The page's server has failed; the daemon starts it again."
 """Message to the open pages before a failed server ends."""
-_STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
+_STATIC_FILE_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
 """Pattern of the names of the page's static files."""
 
 
 class OperatorPageServer:
     """Serves the operator's page of one rig.
 
-    `job` has the data of the rig that the daemon sends at the start: see `rigd.daemon._page`.
+    `page_job` has the data of the rig that the daemon sends at the start: see `rigd.daemon._page`.
     """
 
-    def __init__(self, job: Document) -> None:
-        self._job = job
-        self._socket = Path(job["socket"])
-        self._access = WebAccess(job["token"])
+    def __init__(self, page_job: Document) -> None:
+        self._page_job = page_job
+        self._socket = Path(page_job["socket"])
+        self._access = WebAccess(page_job["token"])
         self.pages = Pages()
-        self._jobs = Jobs(Path(job["folder"]), self.pages.send)
-        self._library = Library(Path(job["folder"]), self._access, self._jobs)
-        self._stopping = ThreadPoolExecutor(_MAX_STOPS, "stop")
+        self._jobs = Jobs(Path(page_job["folder"]), self.pages.send)
+        self._library = Library(Path(page_job["folder"]), self._access, self._jobs)
+        self._stopping = ThreadPoolExecutor(_MAX_SIMULTANEOUS_STOPS, "stop")
         self._link = DaemonLink(self._socket, self._process_message, self._report_loss)
         self._excitations = dict(_excitations())
-        self._nominal_response = self._nominal_message(job)
+        self._nominal_response = self._nominal_message(page_job)
         self._specimens: list[str] = []
         self._status: Document | None = None
         self._lost_message: Document | None = None
@@ -116,9 +116,9 @@ class OperatorPageServer:
             self._link.run(), self._jobs.run(), self._send_responses(), self._find_specimens()
         )
 
-    def end(self, reason: str) -> None:
+    def end(self, end_message: str) -> None:
         """Inform the open pages that this server ends, with the reason."""
-        self._report_loss(reason)
+        self._report_loss(end_message)
 
     # Requests
 
@@ -128,7 +128,7 @@ class OperatorPageServer:
             "name", "index.html" if request.path == "/" else "favicon.svg"
         )
         file_path = Path(str(files("rigd.web") / "static" / file_name))
-        if not _STATIC_NAME.fullmatch(file_name) or not file_path.is_file():
+        if not _STATIC_FILE_NAME.fullmatch(file_name) or not file_path.is_file():
             return refusal_response(404, "There is no such file.")
         icon_headers = {"Cross-Origin-Resource-Policy": "cross-origin"}
         return web.FileResponse(
@@ -139,13 +139,13 @@ class OperatorPageServer:
         """Send live messages to a page until it is closed."""
         hello_message = {
             "type": "hello",
-            "profile": self._job["profile"],
-            "description": self._job["description"],
-            "limits": self._job["limits"],
+            "profile": self._page_job["profile"],
+            "description": self._page_job["description"],
+            "limits": self._page_job["limits"],
             "daemon": None if self._status is None else self._status["daemon"],
             "excitations": self._excitations,
             "specimens": self._specimens,
-            "required_meta": self._job["required_meta"],
+            "required_meta": self._page_job["required_meta"],
             "units": dict(UNITS),
         }
         first_messages = (
@@ -164,8 +164,8 @@ class OperatorPageServer:
         """Send a command of the page to the daemon, and its reply to the page."""
         request_object = await read_json_object(request)
         command = request_object.get("command")
-        if not isinstance(command, str) or command not in _COMMANDS:
-            return refusal_response(400, f"command: choose {', '.join(sorted(_COMMANDS))}.")
+        if not isinstance(command, str) or command not in _PAGE_COMMANDS:
+            return refusal_response(400, f"command: choose {', '.join(sorted(_PAGE_COMMANDS))}.")
         if not self._access.may_command(request, command, request_object.get("parameters")):
             return refusal_response(
                 403, "The token is missing or wrong: open the address of rigd status."
@@ -217,7 +217,7 @@ class OperatorPageServer:
             # The status contains the last fit, also for pages that open later.
             self._link.request_status()
         elif event_name == "message":
-            self.pages.log(message["level"], message["text"])
+            self.pages.log_message(message["level"], message["text"])
         else:
             del message["event"]
             self.pages.send({"type": event_name, **message})
@@ -226,7 +226,7 @@ class OperatorPageServer:
             if event_name == "session":
                 self._start_search(self._find_specimens())
             elif event_name == "quick_look":
-                self.pages.log("info", "\n".join(QuickLook.from_event(message).lines))
+                self.pages.log_message("info", "\n".join(QuickLook.from_event(message).lines))
 
     def _process_status(self, status: Document) -> None:
         """Send the daemon's status to the open pages, and prepare for a session that has begun."""
@@ -253,9 +253,9 @@ class OperatorPageServer:
         if session_series["excitation"] != "hold":
             self._response = SessionResponse(
                 sweep_ticks(session_plan["segments"]),
-                self._job["rate_hz"],
-                angle_delay_s=self._job["angle_delay_s"],
-                torque_delay_s=self._job["torque_delay_s"],
+                self._page_job["rate_hz"],
+                angle_delay_s=self._page_job["angle_delay_s"],
+                torque_delay_s=self._page_job["torque_delay_s"],
             )
         self.pages.send(self._nominal_response)  # the pages then clear the other responses
         specimen_name = str(session_series["notes"].get("specimen", ""))
@@ -264,7 +264,7 @@ class OperatorPageServer:
     def _nominal_message(self, beam_document: Document) -> Document:
         """Return the message with the nominal frequency response of a beam with its damping."""
         beam, damping = Beam(**beam_document["beam"]), Damping(**beam_document["damping"])
-        return nominal_document(beam, damping, self._job["tool_inertia_kg_m2"])
+        return nominal_document(beam, damping, self._page_job["tool_inertia_kg_m2"])
 
     def _process_signals(self, event: Document) -> None:
         """Send a block of signals and the gauges to the open pages."""
@@ -294,13 +294,13 @@ class OperatorPageServer:
         while True:
             await asyncio.sleep(_RESPONSE_PERIOD_S)
             if self._response is not None and self.pages:
-                shown_response = self._response.document()
+                shown_response = self._response.response_message()
                 self._shown = shown_response or self._shown
                 self.pages.send(shown_response)
 
-    def _start_search(self, search: Awaitable[None]) -> None:
+    def _start_search(self, search_coroutine: Awaitable[None]) -> None:
         """Start a search in the recorded sessions, without waiting for its end."""
-        search_task = asyncio.ensure_future(search)
+        search_task = asyncio.ensure_future(search_coroutine)
         self._searches.add(search_task)
         search_task.add_done_callback(self._searches.discard)
 
@@ -310,17 +310,19 @@ class OperatorPageServer:
             recorded_specimens = await self._library.specimens()
             self._specimens = list(dict.fromkeys([*recorded_specimens, *specimen_files()]))
 
-    async def _send_last_response(self, specimen: str, session_path: str) -> None:
+    async def _send_last_response(self, specimen_name: str, session_path: str) -> None:
         """Send the open pages the frequency response of a specimen's last session.
 
         The running session in `session_path` does not count as the last one. Nothing is sent if
         another session has begun when the response is found.
         """
         with suppress(OSError, ValueError):
-            response = await self._library.last_response(specimen, Path(session_path).stem)
+            response_message = await self._library.last_response(
+                specimen_name, Path(session_path).stem
+            )
             if session_path == self._latest_session:
-                self._last_response = response
-                self.pages.send(response)
+                self._last_response = response_message
+                self.pages.send(response_message)
 
 
 def _excitations() -> Iterator[tuple[str, list[Document]]]:
@@ -350,44 +352,46 @@ def run_page() -> None:
     # No log: a stopped terminal (Ctrl-S) would block all pages, and invalid requests would fill the
     # journal.
     logging.disable()
-    daemon = SupervisorConnection()
-    asyncio.run(_serve_until_end(daemon, daemon.receive_job()))
+    daemon_connection = SupervisorConnection()
+    asyncio.run(_serve_until_end(daemon_connection, daemon_connection.receive_job()))
 
 
-async def _serve_until_end(daemon: SupervisorConnection, job: Document) -> None:
+async def _serve_until_end(daemon_connection: SupervisorConnection, page_job: Document) -> None:
     """Serve the page of a job until the daemon ends or the server fails."""
     try:
-        page_server, _, listening_server = await start_page_server(job)
+        page_server, _, listening_server = await start_page_server(page_job)
     except OSError as error:
-        daemon.send(ProcessFailed(f"port {job['port']} cannot be opened: {error.strerror}"))
+        daemon_connection.send(
+            ProcessFailed(f"port {page_job['port']} cannot be opened: {error.strerror}")
+        )
         return
-    daemon.send(PageAddress(port_of(listening_server)))
+    daemon_connection.send(PageAddress(port_of(listening_server)))
     server_task = asyncio.create_task(page_server.run())
-    daemon_ended = asyncio.get_running_loop().run_in_executor(None, daemon.poll, None)
-    await asyncio.wait((server_task, daemon_ended), return_when=asyncio.FIRST_COMPLETED)
+    daemon_end = asyncio.get_running_loop().run_in_executor(None, daemon_connection.poll, None)
+    await asyncio.wait((server_task, daemon_end), return_when=asyncio.FIRST_COMPLETED)
     has_failed = server_task.done()
     if has_failed:
-        daemon.send(ProcessFailed(f"unexpected error ({server_task.exception()!r})"))
+        daemon_connection.send(ProcessFailed(f"unexpected error ({server_task.exception()!r})"))
     # The successor of this process or of the daemon may need the port.
     listening_server.close()
     page_server.end(
         _FAILED_MESSAGE if has_failed else "The daemon has ended; start it with rigd serve."
     )
-    await asyncio.sleep(_LAST_MESSAGES_S)
+    await asyncio.sleep(_LAST_MESSAGES_TIMEOUT_S)
     # A regular exit would wait for reading clients and for the thread that waits for the daemon.
     os._exit(1 if has_failed else 0)
 
 
 async def start_page_server(
-    job: Document,
+    page_job: Document,
 ) -> tuple[OperatorPageServer, web.AppRunner, asyncio.Server]:
     """Start the page's server on the port of a job, or on a free port if the job permits it.
 
     Return the server, whose `run` must be called, the runner of its application, and the listening
-    server. `job` is that of `OperatorPageServer`, with ``port`` and ``any_port``. Raise `OSError`
-    if the port is not available.
+    server. `page_job` is that of `OperatorPageServer`, with ``port`` and ``any_port``. Raise
+    `OSError` if the port is not available.
     """
-    page_server, connections = OperatorPageServer(job), Connections()
+    page_server, connections = OperatorPageServer(page_job), Connections()
     web_application = page_server.application()
     web_application.middlewares.append(connections.register_request)
     app_runner = web.AppRunner(
@@ -397,7 +401,7 @@ async def start_page_server(
         auto_decompress=False,
         keepalive_timeout=_KEEP_ALIVE_S,
         lingering_time=_LINGERING_TIME_S,
-        shutdown_timeout=_LAST_MESSAGES_S,
+        shutdown_timeout=_LAST_MESSAGES_TIMEOUT_S,
     )
     await app_runner.setup()
     assert app_runner.server is not None
@@ -405,13 +409,13 @@ async def start_page_server(
     event_loop = asyncio.get_running_loop()
     try:
         listening_server = await event_loop.create_server(
-            connections.accept_connection, _LOOPBACK, job["port"]
+            connections.accept_connection, _LOOPBACK_ADDRESS, page_job["port"]
         )
     except OSError:
-        if not job["any_port"]:
+        if not page_job["any_port"]:
             raise
         listening_server = await event_loop.create_server(
-            connections.accept_connection, _LOOPBACK, 0
+            connections.accept_connection, _LOOPBACK_ADDRESS, 0
         )
     connections.close_silent_connections()
     return page_server, app_runner, listening_server

@@ -23,11 +23,11 @@ ENVELOPE_POINT_S: Final = 0.05
 """Duration in seconds of each point of an envelope."""
 _STORED_DURATION_S: Final = 10.0
 """Seconds of the envelopes that are stored for new pages."""
-_BIN_STEP: Final = 4
+_FREQUENCY_STEP_FACTOR: Final = 4
 """Factor by which the shown frequencies are farther apart than those of `analyze` (1/160 Hz).
 
 There are still two frequencies per resolution of a segment."""
-_DECIMALS: Final = 6
+_ENVELOPE_DECIMALS: Final = 6
 """Number of decimals of the envelopes."""
 _BLOCKS_PER_UPDATE: Final = 20
 """Number of blocks of signals that are passed to the frequency response together."""
@@ -52,7 +52,7 @@ class PageSignalBlock:
     """Number of the block's first tick."""
     rate_hz: float
     """Loop rate in ticks per second."""
-    values: RealArray
+    signal_values: RealArray
     """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n); NaN if unknown."""
 
     @classmethod
@@ -92,7 +92,7 @@ class SignalEnvelopes:
     def feed(self, signal_block: PageSignalBlock) -> Document | None:
         """Add a block of signals; return the message with new envelope points, or None."""
         ticks_per_point = max(1, round(ENVELOPE_POINT_S * signal_block.rate_hz))
-        signal_values = signal_block.values
+        signal_values = signal_block.signal_values
         missing_ticks = signal_block.first_tick - self._next_tick
         if missing_ticks < 0 or missing_ticks > _STORED_DURATION_S * signal_block.rate_hz:
             self._points.clear()
@@ -113,11 +113,13 @@ class SignalEnvelopes:
         )
         # Unlike nanmin and nanmax, these do not warn of points without known values.
         smallest, largest = np.fmin.reduce(point_bins, axis=2), np.fmax.reduce(point_bins, axis=2)
-        extremes = np.stack((smallest, largest), axis=1).reshape(6, point_count).round(_DECIMALS)
-        points = [tuple(_without_nan(point_values)) for point_values in extremes.T]
+        bin_extremes = (
+            np.stack((smallest, largest), axis=1).reshape(6, point_count).round(_ENVELOPE_DECIMALS)
+        )
+        envelope_points = [tuple(_without_nan(point_values)) for point_values in bin_extremes.T]
         first_point, self._next_point = self._next_point, self._next_point + point_count
-        self._points.extend(points)
-        return _envelope_message(first_point, points)
+        self._points.extend(envelope_points)
+        return _envelope_message(first_point, envelope_points)
 
     def stored_message(self) -> Document | None:
         """Return the message for a new page with all stored points, or None if there are none."""
@@ -147,9 +149,9 @@ def _envelope_message(first_index: int, points: list[tuple[float | None, ...]]) 
     }
 
 
-def _without_nan(numbers: RealArray) -> list[float | None]:
+def _without_nan(numbers_with_nan: RealArray) -> list[float | None]:
     """Return an array's numbers as a list, with None instead of NaN."""
-    return [None if number != number else number for number in numbers.tolist()]
+    return [None if number != number else number for number in numbers_with_nan.tolist()]
 
 
 # Frequency response
@@ -158,20 +160,22 @@ def _without_nan(numbers: RealArray) -> list[float | None]:
 class SessionResponse:
     """Estimates the frequency response of a running session up to the sweep's present frequency.
 
-    `sweep` has the first tick and the (exclusive) end of the sweep. Delays are the ages of angle
-    and torque at their time stamps.
+    `sweep_ticks` has the first tick and the (exclusive) end of the sweep. Delays are the ages of
+    angle and torque at their time stamps.
     """
 
     def __init__(
         self,
-        sweep: tuple[int, int],
+        sweep_ticks: tuple[int, int],
         rate_hz: float,
         *,
         angle_delay_s: float = 0.0,
         torque_delay_s: float = 0.0,
     ) -> None:
         self._delays_s = {"input_delay_s": angle_delay_s, "output_delay_s": torque_delay_s}
-        self._sweep = SweepResponse(sweep, rate_hz, LAST_HZ, resolution_divisor=_BIN_STEP)
+        self._sweep = SweepResponse(
+            sweep_ticks, rate_hz, LAST_HZ, resolution_divisor=_FREQUENCY_STEP_FACTOR
+        )
         self._thinning: CurveDecimation | None = None
         self._queued_blocks: list[PageSignalBlock] = []
         self._has_new_data = False
@@ -188,52 +192,54 @@ class SessionResponse:
         if not self._queued_blocks:
             return
         signal_values = np.concatenate(
-            [queued_block.values for queued_block in self._queued_blocks], axis=1
+            [queued_block.signal_values for queued_block in self._queued_blocks], axis=1
         )
         tick_numbers = np.concatenate(
             [
-                queued_block.first_tick + np.arange(queued_block.values.shape[1])
+                queued_block.first_tick + np.arange(queued_block.signal_values.shape[1])
                 for queued_block in self._queued_blocks
             ]
         )
         self._queued_blocks.clear()
-        is_known = np.isfinite(signal_values[0])
-        if is_known.any():
-            known_samples = np.zeros(int(is_known.sum()), dtype=_SAMPLE_TYPE)
-            known_samples["tick"] = tick_numbers[is_known]
+        is_sample_known = np.isfinite(signal_values[0])
+        if is_sample_known.any():
+            known_samples = np.zeros(int(is_sample_known.sum()), dtype=_SAMPLE_TYPE)
+            known_samples["tick"] = tick_numbers[is_sample_known]
             for field_name, signal in zip(_SIGNAL_NAMES, signal_values, strict=True):
-                known_samples[field_name] = signal[is_known]
+                known_samples[field_name] = signal[is_sample_known]
             self._sweep.feed(known_samples)
             self._has_new_data = True
 
-    def document(self) -> Document | None:
+    def response_message(self) -> Document | None:
         """Return the message with the estimated response, or None if it has not changed."""
         self._feed_sweep()
         sweep_estimate = self._sweep.estimate() if self._has_new_data else None
         self._has_new_data = False
         if sweep_estimate is None or not sweep_estimate.excited.any():
             return None
-        reached_hz = float(sweep_estimate.response.frequency_hz[sweep_estimate.excited][-1])
-        if sweep_estimate.final and reached_hz < self._reached_hz:
+        highest_reached_hz = float(sweep_estimate.response.frequency_hz[sweep_estimate.excited][-1])
+        if sweep_estimate.final and highest_reached_hz < self._reached_hz:
             return None  # the last complete segment ends before the sweep
-        self._reached_hz = reached_hz
+        self._reached_hz = highest_reached_hz
         response = sweep_estimate.response.without_delays(**self._delays_s)
-        grid_hz = response.frequency_hz
+        grid_frequencies_hz = response.frequency_hz
         if self._thinning is None:
-            self._thinning = response_decimation(grid_hz)
+            self._thinning = response_decimation(grid_frequencies_hz)
         shown_response = np.where(sweep_estimate.excited, response.response, np.nan)
         # The unknown values at both ends of a gap interrupt the line.
-        magnitude = np.abs(shown_response)
-        shown_points = np.union1d(
-            self._thinning.extremes(magnitude), self._thinning.gaps(magnitude)
+        shown_magnitudes = np.abs(shown_response)
+        shown_indices = np.union1d(
+            self._thinning.extremes(shown_magnitudes), self._thinning.gaps(shown_magnitudes)
         )
         coherence = None
         if response.coherence is not None:
-            coherence = _without_nan(np.round(response.coherence[shown_points], 4))
-        return _response_document(grid_hz[shown_points], shown_response[shown_points]) | {
+            coherence = _without_nan(np.round(response.coherence[shown_indices], 4))
+        return _response_document(
+            grid_frequencies_hz[shown_indices], shown_response[shown_indices]
+        ) | {
             "type": "response",
             "coherence": coherence,
-            "reached_hz": round(reached_hz, 3),
+            "reached_hz": round(highest_reached_hz, 3),
         }
 
 
@@ -242,11 +248,11 @@ def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) ->
 
     `tool_inertia_kg_m2` is the inertia between sensor and beam.
     """
-    grid_hz, model_response = nominal_response(beam, damping, tool_inertia_kg_m2)
-    shown_points = response_decimation(grid_hz).extremes(np.abs(model_response))
+    grid_frequencies_hz, model_response = nominal_response(beam, damping, tool_inertia_kg_m2)
+    shown_indices = response_decimation(grid_frequencies_hz).extremes(np.abs(model_response))
     return {
         "type": "nominal",
-        **_response_document(grid_hz[shown_points], model_response[shown_points]),
+        **_response_document(grid_frequencies_hz[shown_indices], model_response[shown_indices]),
     }
 
 

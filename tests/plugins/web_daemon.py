@@ -148,7 +148,7 @@ class Served(Requests):
         behind.close()
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
-        self.server.pages.drop_all()
+        self.server.pages.close_all_connections()
         for writer in self.daemon.watchers:
             writer.close()
         await runner.cleanup()
@@ -212,7 +212,7 @@ JobError, Jobs, MAX_JOBS = _jobs.JobError, _jobs.Jobs, _jobs.MAX_JOBS
 _PARTS = {
     "silent_s": (_access, "_FIRST_REQUEST_TIMEOUT_S"),
     "read_s": (_access, "_BODY_TIMEOUT_S"),
-    "most_connections": (_access, "_MAX_CONNECTIONS"),
+    "most_connections": (_access, "_MAX_OPEN_CONNECTIONS"),
     "most_pages": (_live, "MAX_PAGES"),
     "most_waiting": (_live, "_MAX_QUEUED_MESSAGES"),
     "list_sessions": (_library, "list_sessions"),

@@ -215,7 +215,7 @@ def test_job_is_suspended_during_a_session(jobs, tmp_path):
             await asyncio.sleep(0.01)
 
     async def scenario():
-        job = jobs.put("report", [program], "a")
+        job = jobs.add_job("report", [program], "a")
         await asyncio.sleep(0.1)
         assert not (tmp_path / "pid").exists()  # it has not begun
         jobs.paused = False
@@ -246,7 +246,7 @@ _jobs._POLL_PERIOD_S = 0.02
 
 async def work():
     jobs = _jobs.Jobs(pathlib.Path(), lambda _: None)
-    jobs.put("report", [sys.argv[1]])
+    jobs.add_job("report", [sys.argv[1]])
     jobs.paused = False
     asyncio.create_task(jobs.run())
     while not pathlib.Path("pids").exists():
@@ -307,10 +307,10 @@ def test_job_ends_with_the_page(tmp_path, state, end):
 def test_results_of_jobs_are_published(jobs):
     async def scenario():
         jobs.paused = False
-        done = jobs.put("campaign", ["pass"], result_url="/api/campaign/x/")
-        failed = jobs.put("report", ["import sys; sys.exit('too short')"], "b", "/there")
-        await failed.done.wait()
-        assert done.done.is_set()
+        done = jobs.add_job("campaign", ["pass"], result_url="/api/campaign/x/")
+        failed = jobs.add_job("report", ["import sys; sys.exit('too short')"], "b", "/there")
+        await failed.end_event.wait()
+        assert done.end_event.is_set()
 
     run(jobs, scenario)
     last = {document["number"]: document for document in jobs.documents}
@@ -323,9 +323,9 @@ def test_number_of_waiting_jobs_is_limited(jobs):
     async def scenario():
         for _ in range(MAX_JOBS + 1):
             await asyncio.sleep(0)
-            jobs.put("report", ["pass"])
+            jobs.add_job("report", ["pass"])
         with pytest.raises(JobError):
-            jobs.put("report", ["pass"])
+            jobs.add_job("report", ["pass"])
 
     run(jobs, scenario)
 

@@ -26,8 +26,8 @@ def test_block_from_an_event():
         for k, name in enumerate(("angle_rad", "angle_reference_rad", "coupling_torque_nm"))
     }
     decoded = PageSignalBlock.from_event(encoded | {"first_tick": 7, "rate_hz": RATE_HZ})
-    assert (decoded.first_tick, decoded.values[:, 0].tolist()) == (7, [0.0, 1.0, 2.0])
-    assert np.isnan(decoded.values[0, 1])
+    assert (decoded.first_tick, decoded.signal_values[:, 0].tolist()) == (7, [0.0, 1.0, 2.0])
+    assert np.isnan(decoded.signal_values[0, 1])
 
 
 @pytest.mark.parametrize("block_size", [1, 7, 51, 400])
@@ -91,7 +91,7 @@ def make_response(ticks):
 def test_response_is_that_of_the_record(sweep):
     angle, torque, known = sweep
     growing = make_response(angle.size)
-    assert growing.document() is None
+    assert growing.response_message() is None
     growing.feed(block(0, np.zeros(1000)))
     reached = []
     document = None
@@ -99,9 +99,9 @@ def test_response_is_that_of_the_record(sweep):
         part = slice(first, first + 5000)
         shown = np.where(known[part], angle[part], np.nan)
         growing.feed(block(1000 + first, shown, angle[part], torque[part]))
-        document = growing.document() or document
+        document = growing.response_message() or document
         reached.append(document and document["reached_hz"])
-        assert growing.document() is None  # nothing new
+        assert growing.response_message() is None  # nothing new
     reached = [each for each in reached if each is not None]
     assert reached == sorted(reached)
     assert reached[-1] > 15.0  # of 20.5 Hz: the last whole segment and the newest samples
@@ -123,7 +123,7 @@ def test_no_line_across_frequencies_without_excitation():
     growing = make_response(angle.size)
     growing.feed(block(0, np.zeros(1000)))
     growing.feed(block(1000, angle, torque=3 * angle))
-    document = growing.document()
+    document = growing.response_message()
     grid = np.array(document["frequency_hz"])
     nothing = np.array([each is None for each in document["magnitude"]])
     assert nothing[(grid > 5.0) & (grid < 11.0)].all()
