@@ -81,7 +81,7 @@ def highest_rate(seconds: float) -> float:
         held = max(one.held_fraction for one in tries)
         between = max(one.held_fraction_between_stalls for one in tries)
         best = max(tries, key=lambda one: one.held_fraction_between_stalls)
-        late, work = percentiles(best.lateness_us), percentiles(best.work_us)
+        late, work = percentiles(best.latencies_us), percentiles(best.execution_times_us)
         print(
             f"  {rate_hz:6.0f} Hz held {100 * held:7.3f} %, but for stalls {100 * between:7.3f} %  "
             f"late p99 {late.p99:4.0f}  work p50 {work.p50:3.0f} p99 {work.p99:4.0f}  "
@@ -115,7 +115,7 @@ def main() -> None:
         for which in ("p50", "p99"):
             ratio = lateness_ratio(rounds, over, under, which)
             gate.measured(f"lateness {which}, {over}", ratio)
-    worst = max(percentiles(found[LOADED].work_us).p99 for found in rounds)
+    worst = max(percentiles(found[LOADED].execution_times_us).p99 for found in rounds)
     gate.measured("work p99 with everything, worst round", worst)
     costs = [
         statistics.median(found[name].cpu_percent for found in rounds) for name in (IDLE, SPUN)

@@ -14,13 +14,13 @@ def show(found: Round) -> None:
     """Print a round, in µs."""
     print(f"load {os.getloadavg()[0]:.2f}")
     for name, one in found.items():
-        late = percentiles(one.lateness_us)
+        late = percentiles(one.latencies_us)
         line = (
             f"  {name:17s} late p50 {late.p50:5.1f} p99 {late.p99:6.1f} p99.9 {late.p999:6.0f} "
-            f"max {late.largest:6.0f}  missed {one.missed} of {one.scheduled}"
+            f"max {late.largest:6.0f}  missed {one.missed_ticks} of {one.scheduled_ticks}"
         )
-        if one.work_us.size:
-            work = percentiles(one.work_us)
+        if one.execution_times_us.size:
+            work = percentiles(one.execution_times_us)
             line += f"  work p50 {work.p50:5.1f} p99 {work.p99:5.1f}"
         if one.cpu_percent is not None:
             line += f"  CPU {one.cpu_percent:.1f} %"
@@ -32,7 +32,7 @@ def lateness_ratio(rounds: Sequence[Round], over: str, under: str, which: str) -
 
     def value(one: LoopMeasurement) -> float:
         # cyclictest, one of the peers, counts whole microseconds.
-        return max(1.0, getattr(percentiles(one.lateness_us), which))
+        return max(1.0, getattr(percentiles(one.latencies_us), which))
 
     return statistics.median(value(found[over]) / value(found[under]) for found in rounds)
 
@@ -46,7 +46,7 @@ def median_difference(
 
 def median_work_us(one: LoopMeasurement) -> float:
     """Return the median work of a tick."""
-    return percentiles(one.work_us).p50
+    return percentiles(one.execution_times_us).p50
 
 
 def in_turn(names: Sequence[str], number: int) -> list[str]:

@@ -81,8 +81,8 @@ def parse_measurement(program_output: str, rate_hz: float) -> LoopMeasurement:
         rate_hz,
         delays_us,
         np.empty(0),
-        scheduled=delays_us.size + missed_ticks,
-        missed=missed_ticks,
+        scheduled_ticks=delays_us.size + missed_ticks,
+        missed_ticks=missed_ticks,
     )
 
 

@@ -102,7 +102,7 @@ class BenchResults:
         They are medians over the rounds. Return None if cyclictest did not run.
         """
         percentile_pairs = [
-            (percentiles(loop_alone.lateness_us), percentiles(peer.lateness_us))
+            (percentiles(loop_alone.latencies_us), percentiles(peer.latencies_us))
             for loop_alone, peer in self.rounds
             if peer is not None
         ]

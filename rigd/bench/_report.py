@@ -52,7 +52,7 @@ def report_lines(results: BenchResults) -> Iterator[str]:
     yield ""
     yield "Wake-up latency:"
     histogram_columns = [
-        (loop_measurement.name, loop_measurement.lateness_us)
+        (loop_measurement.name, loop_measurement.latencies_us)
         for loop_measurement in _measurements(results)[:2]
     ]
     yield from histogram_lines(histogram_columns)
@@ -158,7 +158,7 @@ def _latency_table(measurements: list[LoopMeasurement]) -> Iterator[str]:
         f"{'p50':>8}{'p99':>8}   {'%':>7}  {'%':>5}"
     )
     for measurement in measurements:
-        latency_percentiles = percentiles(measurement.lateness_us)
+        latency_percentiles = percentiles(measurement.latencies_us)
         shown_percentiles_us = (
             latency_percentiles.p50,
             latency_percentiles.p90,
@@ -169,8 +169,8 @@ def _latency_table(measurements: list[LoopMeasurement]) -> Iterator[str]:
         row_text = f"{measurement.name:{_NAME_COLUMN_WIDTH}}" + "".join(
             f"{percentile_us:8.0f}" for percentile_us in shown_percentiles_us
         )
-        if measurement.work_us.size:
-            execution_percentiles = percentiles(measurement.work_us)
+        if measurement.execution_times_us.size:
+            execution_percentiles = percentiles(measurement.execution_times_us)
             row_text += f"   {execution_percentiles.p50:8.0f}{execution_percentiles.p99:8.0f}"
         else:
             row_text += " " * 19
@@ -192,8 +192,8 @@ def _rate_table(search_measurements: list[LoopMeasurement]) -> Iterator[str]:
             f"{measurement.rate_hz:7.0f} "
             f"Hz{100 * measurement.held_fraction:9.3f}"
             f"{100 * measurement.held_fraction_between_stalls:12.3f}"
-            f"{measurement.stall_count:8d}{percentiles(measurement.lateness_us).p99:14.0f}"
-            f"{percentiles(measurement.work_us).p99:14.0f}{cpu_text}"
+            f"{measurement.stall_count:8d}{percentiles(measurement.latencies_us).p99:14.0f}"
+            f"{percentiles(measurement.execution_times_us).p99:14.0f}{cpu_text}"
         )
 
 
@@ -215,19 +215,21 @@ def _as_dict(measurement: LoopMeasurement) -> dict[str, object]:
     return {
         "name": measurement.name,
         "rate_hz": measurement.rate_hz,
-        "scheduled": measurement.scheduled,
-        "missed": measurement.missed,
+        "scheduled": measurement.scheduled_ticks,
+        "missed": measurement.missed_ticks,
         "held": measurement.held_fraction,
         "held_between_stalls": measurement.held_fraction_between_stalls,
         "stalls": measurement.stall_count,
-        "lateness_us": _percentiles_object(measurement.lateness_us),
-        "work_us": _percentiles_object(measurement.work_us) if measurement.work_us.size else None,
+        "lateness_us": _percentiles_object(measurement.latencies_us),
+        "work_us": _percentiles_object(measurement.execution_times_us)
+        if measurement.execution_times_us.size
+        else None,
         "cpu_percent": measurement.cpu_percent,
         "page_faults": measurement.page_faults,
         "histogram_us": dict(
             zip(
                 (f"{edge_us:g}" for edge_us in histogram_edges_us()),
-                histogram_counts(measurement.lateness_us),
+                histogram_counts(measurement.latencies_us),
                 strict=True,
             )
         ),

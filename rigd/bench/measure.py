@@ -113,13 +113,13 @@ class LoopMeasurement:
     """Name of the measurement, which states the load."""
     rate_hz: float
     """Rate of the loop."""
-    lateness_us: npt.NDArray[np.float64]
+    latencies_us: npt.NDArray[np.float64]
     """Wake-up latency of every tick that was run, shape (n,)."""
-    work_us: npt.NDArray[np.float64]
+    execution_times_us: npt.NDArray[np.float64]
     """Execution time of every tick, shape (n,), or an empty array if the loop did no work."""
-    scheduled: int
+    scheduled_ticks: int
     """Number of scheduled ticks."""
-    missed: int
+    missed_ticks: int
     """Number of missed ticks."""
     cpu_percent: float | None = None
     """Load of one core by the loop's process in percent, or None if it was not measured."""
@@ -129,19 +129,21 @@ class LoopMeasurement:
     @property
     def held_fraction(self) -> float:
         """Fraction of scheduled ticks that were run within their periods."""
-        return 1.0 - self.missed / self.scheduled
+        return 1.0 - self.missed_ticks / self.scheduled_ticks
 
     @property
     def held_fraction_between_stalls(self) -> float:
         """Fraction of scheduled ticks outside of stalls that were run within their periods."""
-        stalls_us = self.lateness_us[self.lateness_us >= MIN_STALL_US]
-        stalled_ticks = min(self.missed, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum()))
-        return 1.0 - (self.missed - stalled_ticks) / (self.scheduled - stalled_ticks)
+        stalls_us = self.latencies_us[self.latencies_us >= MIN_STALL_US]
+        stalled_ticks = min(
+            self.missed_ticks, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum())
+        )
+        return 1.0 - (self.missed_ticks - stalled_ticks) / (self.scheduled_ticks - stalled_ticks)
 
     @property
     def stall_count(self) -> int:
         """Number of wake-up latencies of at least `MIN_STALL_US`."""
-        return int(np.count_nonzero(self.lateness_us >= MIN_STALL_US))
+        return int(np.count_nonzero(self.latencies_us >= MIN_STALL_US))
 
 
 def percentiles(delays_us: npt.NDArray[np.float64]) -> LatencyPercentiles:
@@ -240,10 +242,10 @@ def pool_measurements(name: str, measurements: list[LoopMeasurement]) -> LoopMea
     return LoopMeasurement(
         name,
         measurements[0].rate_hz,
-        np.concatenate([measurement.lateness_us for measurement in measurements]),
-        np.concatenate([measurement.work_us for measurement in measurements]),
-        sum(measurement.scheduled for measurement in measurements),
-        sum(measurement.missed for measurement in measurements),
+        np.concatenate([measurement.latencies_us for measurement in measurements]),
+        np.concatenate([measurement.execution_times_us for measurement in measurements]),
+        sum(measurement.scheduled_ticks for measurement in measurements),
+        sum(measurement.missed_ticks for measurement in measurements),
         sum(cpu_loads_percent) / len(cpu_loads_percent) if cpu_loads_percent else None,
         sum(page_fault_counts) if page_fault_counts else None,
     )

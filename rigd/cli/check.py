@@ -161,7 +161,7 @@ def bench(
     from rigd.bench import as_json as document_of
     from rigd.bench import report_lines
 
-    results = _run_bench(rig_profile, rate_hz=rate, seconds=seconds, spin_us=spin_us)
+    results = _run_bench(rig_profile, rate_hz=rate, measurement_duration_s=seconds, spin_us=spin_us)
     with contextlib.suppress(BrokenPipeError):
         if as_json:
             typer.echo(json.dumps(document_of(results), ensure_ascii=False))
@@ -170,7 +170,7 @@ def bench(
 
 
 def _run_bench(
-    profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float
+    profile: "Profile", *, rate_hz: float, measurement_duration_s: float, spin_us: float
 ) -> "BenchResults":
     """Run the series of latency measurements with progress on standard error."""
     from rich.console import Console
@@ -196,7 +196,7 @@ def _run_bench(
         bench = Bench(
             profile,
             rate_hz=rate_hz,
-            measurement_duration_s=seconds,
+            measurement_duration_s=measurement_duration_s,
             spin_us=spin_us,
             on_progress=on_progress,
         )

@@ -71,10 +71,10 @@ def serve(
     from rigd.daemon import run_daemon
     from rigd.runner.request import load_rig, make_folder
 
-    page = web or web_port is not None
+    serves_page = web or web_port is not None
     if live:
         require_extra("live", "--live")
-    if page:
+    if serves_page:
         require_extra("rig", "The page")
     rig_profile, _ = load_rig(profile, uses_virtual_clock=fast, force_hardware=hardware)
     make_folder(output)
@@ -84,7 +84,7 @@ def serve(
         group_name=group,
         with_live_view=live,
         uses_virtual_clock=fast,
-        serves_page=page,
+        serves_page=serves_page,
         page_port=web_port,
         makes_quick_looks=not no_quick_look,
     )

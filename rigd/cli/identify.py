@@ -103,8 +103,8 @@ def motor(
             stroke_rad,
             seed,
             session_notes(operator, specimen, note, meta),
-            fast=fast,
-            hardware=hardware,
+            uses_virtual_clock=fast,
+            force_hardware=hardware,
             quiet_stdout=as_json,
         )
     _, proposal = _estimate_motor(files, profile)
@@ -126,8 +126,8 @@ def _run_sessions(
     seed: int | None,
     notes: dict[str, str],
     *,
-    fast: bool,
-    hardware: bool,
+    uses_virtual_clock: bool,
+    force_hardware: bool,
     quiet_stdout: bool,
 ) -> list[Path]:
     """Run a trial session and two sessions for the estimate; return the files of the latter two.
@@ -159,11 +159,11 @@ def _run_sessions(
             session_count=1,
             seed=None if seed is None else seed + session_number,
             notes=notes,
-            uses_virtual_clock=fast,
+            uses_virtual_clock=uses_virtual_clock,
             with_live_view=False,
             allows_saturation=False,
             quiet_stdout=quiet_stdout,
-            force_hardware=hardware,
+            force_hardware=force_hardware,
             prepare_profile=prepare_profile,
             identifies_motor=True,
         )
@@ -201,10 +201,10 @@ def _estimate_motor(files: list[Path], profile_name: str) -> "tuple[MotorEstimat
     from rigd.identification.estimate import estimate_motor
 
     profile = profile_named(profile_name)
-    recording = read_recording(files, profile.rig.actuation.delay_s)
+    motor_recording = read_recording(files, profile.rig.actuation.delay_s)
     motor_estimate = estimate_motor(
-        recording.windows,
-        recording.timing,
-        tool_inertia_kg_m2=recording.tool_inertia_kg_m2,
+        motor_recording.windows,
+        motor_recording.timing,
+        tool_inertia_kg_m2=motor_recording.tool_inertia_kg_m2,
     )
-    return motor_estimate, propose(motor_estimate, profile, unusable_count=recording.unusable)
+    return motor_estimate, propose(motor_estimate, profile, unusable_count=motor_recording.unusable)

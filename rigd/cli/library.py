@@ -15,7 +15,7 @@ from rigd.cli.options import (
     AsJson,
     fail,
     print_error,
-    progress,
+    task_progress,
 )
 from rigd.printable import printable, readable_message
 
@@ -80,7 +80,7 @@ def list_sessions(
     if not folders:
         folders = [SESSIONS_FOLDER] if SESSIONS_FOLDER.exists() else []
     for folder in folders:
-        with progress(folder.name) as on_progress:
+        with task_progress(folder.name) as on_progress:
             rows += sessions_of(
                 folder,
                 specimen=specimen,
@@ -384,7 +384,7 @@ def recover(
     has_failed = False
     for file_path in paths:
         try:
-            with progress(file_path.name) as on_progress:
+            with task_progress(file_path.name) as on_progress:
                 recovery = recover_file(file_path, on_progress)
         except SessionError as error:
             has_failed = True

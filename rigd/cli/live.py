@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, fail, progress
+from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, fail, task_progress
 from rigd.runtime import raise_on_signals
 from rigd.view.rrd_file import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
 
@@ -298,7 +298,10 @@ def _write_rerun_file(session_path: Path, output_path: Path) -> None:
     from rigd.view import draw_session
 
     session, tick_timings = read_session(session_path), read_timings(session_path)
-    with progress(session_path.name) as on_progress, new_rrd_file(output_path) as recording_stream:
+    with (
+        task_progress(session_path.name) as on_progress,
+        new_rrd_file(output_path) as recording_stream,
+    ):
         draw_session(recording_stream, session, tick_timings, on_progress=on_progress)
 
 

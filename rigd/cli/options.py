@@ -53,7 +53,7 @@ _PROGRESS_DELAY_S = 2.0
 
 
 @contextlib.contextmanager
-def progress(task_name: str) -> Iterator[Callable[[float], None]]:
+def task_progress(task_name: str) -> Iterator[Callable[[float], None]]:
     """Show a progress line; yield a function that must be called with the completed fraction.
 
     The line appears after `_PROGRESS_DELAY_S`, on a terminal only.

@@ -216,7 +216,7 @@ def _command_option(parameter: inspect.Parameter) -> inspect.Parameter:
 
 
 def run_sessions(
-    kind: str,
+    excitation_kind: str,
     parameters: "Mapping[str, Value]",
     profile: ProfileName = "sim",
     output: Output = SESSIONS_FOLDER,
@@ -241,9 +241,9 @@ def run_sessions(
     if live:
         require_extra("live", "--live")
     session_metadata = session_notes(operator, specimen, note, meta)
-    with_online_fit = watch_fit or kind == "until"
+    with_online_fit = watch_fit or excitation_kind == "until"
     stop_request, process_group = start_processes(
-        with_live_view=live, with_touch=kind == "touch", with_online_fit=with_online_fit
+        with_live_view=live, with_touch=excitation_kind == "touch", with_online_fit=with_online_fit
     )
     from rigd.runner import SeriesFailedError, run_in_foreground
     from rigd.runner.planning import excitation_for
@@ -251,7 +251,9 @@ def run_sessions(
 
     try:
         session_results = run_in_foreground(
-            partial(excitation_for, kind=kind, parameters=parameters),
+            partial(
+                excitation_for, excitation_kind=excitation_kind, excitation_parameters=parameters
+            ),
             process_group,
             stop_request,
             profile_name=profile,
@@ -268,7 +270,7 @@ def run_sessions(
             force_hardware=hardware,
             with_quick_looks=not no_quick_look,
             obstacles=obstacle or (),
-            starts_at_present_angle=kind in ("move", "touch"),
+            starts_at_present_angle=excitation_kind in ("move", "touch"),
             watch_fit=watch_fit,
         )
     except SeriesFailedError as error:

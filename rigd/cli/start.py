@@ -94,7 +94,7 @@ def start_processes(
 
 
 def start_sessions(
-    kind: str,
+    excitation_kind: str,
     parameters: "Mapping[str, Value]",
     profile: DaemonProfile = None,
     repeat: Repeat = 1,
@@ -127,7 +127,7 @@ def start_sessions(
                 EXIT_WRONG_USE,
             )
     start_request = {
-        "excitation": kind,
+        "excitation": excitation_kind,
         "parameters": {
             parameter_name: str(parameter_value.absolute())
             if isinstance(parameter_value, Path)

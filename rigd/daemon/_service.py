@@ -607,7 +607,7 @@ class Service:
         ):
             return None
         rate_hz = None if self._uses_virtual_clock else self._profile.rig.rate_hz
-        progress_event = progress_document(rig_status, series.planned_series.ticks, rate_hz)
+        progress_event = progress_document(rig_status, series.planned_series.record_ticks, rate_hz)
         return {"session": series.session_number, "repeat": series.request.repeat, **progress_event}
 
     def _message_rates(self) -> dict[str, float | None]:

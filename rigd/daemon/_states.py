@@ -138,15 +138,15 @@ class DaemonStateMachine:
 Document = dict[str, Any]
 
 
-_USER_NAMES: dict[int, str] = {}
+_USER_NAME_BY_UID: dict[int, str] = {}
 """User id → user name, for the users resolved so far."""
 
 
 def resolve_user(uid: int) -> None:
     """Find the name of a user and store it for :class:`Peer`; this may take a long time."""
-    if uid not in _USER_NAMES:
+    if uid not in _USER_NAME_BY_UID:
         with suppress(KeyError):
-            _USER_NAMES[uid] = pwd.getpwuid(uid).pw_name
+            _USER_NAME_BY_UID[uid] = pwd.getpwuid(uid).pw_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,7 @@ class Peer:
     @property
     def user(self) -> str:
         """Name of the client's user, or the user id while the name is unknown."""
-        return _USER_NAMES.get(self.uid, str(self.uid))
+        return _USER_NAME_BY_UID.get(self.uid, str(self.uid))
 
     def __str__(self) -> str:
         return f"process {self.pid} of {self.user}"
@@ -234,7 +234,7 @@ def signals_document(
     return {
         "event": "signals",
         "first_tick": signal_block.first_tick,
-        "count": signal_block.count,
+        "count": signal_block.tick_count,
         "rate_hz": rate_hz,
         "t_ns": signal_block.t_ns,
         **{

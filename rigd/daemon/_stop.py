@@ -132,7 +132,7 @@ class _StopOfAll:
         """Stop the sessions, wait for their end, and return the report."""
         daemons = self._find_daemons()
         for daemon in daemons:
-            daemon.begin()
+            daemon.begin_stop()
         unended_supervisors = self._stop_supervisors(daemons)
         disabled_drive_pids = {
             supervisor_stop.process.pid
@@ -320,7 +320,7 @@ class _DaemonStop:
         self.doubt = "It accepts no connection." if peer is None else self._reason_to_doubt(*peer)
         """Sentence that states why the daemon's replies are not trusted; empty if they are."""
 
-    def begin(self) -> None:
+    def begin_stop(self) -> None:
         """Start the thread that stops the daemon's session."""
         self._thread.start()
 

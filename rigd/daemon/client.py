@@ -170,7 +170,7 @@ class Client:
         """Close the connection; a running session continues."""
         self._socket.close()
 
-    def ask(self, command: str, **fields: object) -> Document:
+    def ask(self, command: str, **request_fields: object) -> Document:
         """Send a request to the daemon, and return its reply.
 
         Events that arrive meanwhile are stored for :meth:`next_event`. If the daemon has too many
@@ -180,7 +180,7 @@ class Client:
         ----------
         command
             Name of a request in docs/control_socket.md.
-        **fields
+        **request_fields
             Further fields of the request.
 
         Returns
@@ -195,10 +195,10 @@ class Client:
         DaemonUnreachableError
             If the daemon does not reply.
         """
-        return self.request_unless_stopped(lambda: False, command, **fields)
+        return self.request_unless_stopped(lambda: False, command, **request_fields)
 
     def request_unless_stopped(
-        self, is_stop_requested: Callable[[], bool], command: str, **fields: object
+        self, is_stop_requested: Callable[[], bool], command: str, **request_fields: object
     ) -> Document:
         """Send a request like :meth:`ask`, but cancel it if a stop is requested meanwhile.
 
@@ -208,7 +208,7 @@ class Client:
             Function that returns whether a stop is requested; called until the reply arrives.
         command
             Name of a request in docs/control_socket.md that a request `stop` cancels.
-        **fields
+        **request_fields
             Further fields of the request.
 
         Returns
@@ -226,7 +226,7 @@ class Client:
         deadline_s = time.monotonic() + min(_TOO_MANY_CLIENTS_TIMEOUT_S, self._reply_timeout_s)
         while True:
             try:
-                return self._request_once(command, fields, is_stop_requested)
+                return self._request_once(command, request_fields, is_stop_requested)
             except _TooManyClientsError:
                 if time.monotonic() > deadline_s:
                     raise
@@ -235,10 +235,10 @@ class Client:
                 self._connect()
 
     def _request_once(
-        self, command: str, fields: dict[str, object], is_stop_requested: Callable[[], bool]
+        self, command: str, request_fields: dict[str, object], is_stop_requested: Callable[[], bool]
     ) -> Document:
         """Send a request once, and return its reply; after a stop, that to the request `stop`."""
-        self.send(command, **fields)
+        self.send(command, **request_fields)
         is_stop_sent = False
         deadline_s = time.monotonic() + self._reply_timeout_s
         while (remaining_s := deadline_s - time.monotonic()) > 0.0:
@@ -262,14 +262,14 @@ class Client:
             f"{UNKNOWN_STATE_ADVICE}"
         )
 
-    def send(self, command: str, **fields: object) -> None:
+    def send(self, command: str, **request_fields: object) -> None:
         """Send a request without waiting for its reply.
 
         Parameters
         ----------
         command
             Name of a request in docs/control_socket.md.
-        **fields
+        **request_fields
             Further fields of the request.
 
         Raises
@@ -277,7 +277,7 @@ class Client:
         DaemonUnreachableError
             If the request cannot be sent.
         """
-        request_line = json.dumps({"command": command, **fields}).encode() + b"\n"
+        request_line = json.dumps({"command": command, **request_fields}).encode() + b"\n"
         try:
             self._socket.settimeout(_REPLY_TIMEOUT_S)
             self._socket.sendall(request_line)

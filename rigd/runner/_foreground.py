@@ -182,7 +182,9 @@ def run_in_foreground(
                 print_line(line)
             if not (stop.requested or rig.connected):
                 rig.connect(target)
-            with _TerminalProgress(session_series.ticks, session_count, print_line) as operator:
+            with _TerminalProgress(
+                session_series.record_ticks, session_count, print_line
+            ) as operator:
                 session_series.run(
                     rig, stop, operator, with_live_view=with_live_view, quick_looks=quick_looks
                 )
@@ -282,18 +284,18 @@ def _await_quick_looks(quick_looks: QuickLookQueue, stop: StopRequest) -> None:
 
     stop.on_request = skip_quick_looks
     quick_looks.poll()
-    if quick_looks.busy:
+    if quick_looks.is_busy:
         _print("Quick look at the session; Ctrl-C skips it.", to_stderr=True)
     deadline_s = time.monotonic() + _QUICK_LOOK_MAX_WAIT_S
     while (
-        quick_looks.busy
+        quick_looks.is_busy
         and not is_skipped
         and quick_looks.run_time_s < _QUICK_LOOK_MAX_RUN_TIME_S
         and time.monotonic() < deadline_s
     ):
         time.sleep(_POLL_INTERVAL_S)
         quick_looks.poll()
-    if quick_looks.busy and not is_skipped:
+    if quick_looks.is_busy and not is_skipped:
         skip_reason = (
             "took too long"
             if quick_looks.run_time_s >= _QUICK_LOOK_MAX_RUN_TIME_S

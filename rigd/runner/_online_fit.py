@@ -76,7 +76,7 @@ class FitClient(WorkerClient):
             )
         )
 
-    def begin(self, header: FileHeader) -> None:
+    def begin_fits(self, header: FileHeader) -> None:
         """Send the header of the session file to the fit process before the record begins."""
         self._has_begun = True
         self._send(header)

@@ -254,7 +254,7 @@ def _validity_key(profile: Profile, rig: Rig) -> str:
     """
     simulator = find_simulator(profile.rig.name)
     limits = profile.limits
-    dependencies = (
+    hashed_values = (
         _verified_values(parameters_by_dotted_key(profile.rig)),
         (limits.angle_rad, limits.velocity_rad_s),
         dict(rig.drive_statement),
@@ -262,7 +262,7 @@ def _validity_key(profile: Profile, rig: Rig) -> str:
         None if simulator is None else simulator.pid,
     )
     return hashlib.sha256(
-        json.dumps(dependencies, sort_keys=True, default=str).encode()
+        json.dumps(hashed_values, sort_keys=True, default=str).encode()
     ).hexdigest()
 
 

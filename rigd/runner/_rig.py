@@ -107,9 +107,9 @@ class Rig:
         self.zero_lost = False
 
     @property
-    def simulated(self) -> bool:
+    def is_simulated(self) -> bool:
         """Whether the rig is simulated; False before the first connection."""
-        return self._connection is not None and self._connection.simulated
+        return self._connection is not None and self._connection.is_simulated
 
     @property
     def angle_rad(self) -> float:
@@ -188,7 +188,7 @@ class Rig:
         self.connected = True
         self.zero_lost |= self._has_zero_to_lose
         # The angle of this connection is the zero now. Only on hardware can the next one differ.
-        self._has_zero_to_lose = not connection.simulated
+        self._has_zero_to_lose = not connection.is_simulated
 
     def run(
         self,
@@ -231,11 +231,11 @@ class Rig:
         )
         end_outcome = end_reason = ""
         try:
-            run_result = replace(session_run.run(stop), hardware=not self.simulated)
+            run_result = replace(session_run.run(stop), hardware=not self.is_simulated)
             end_outcome, end_reason = run_result.outcome, run_result.reason
             return run_result
         except SessionFailedError as error:
-            error.hardware = not self.simulated
+            error.hardware = not self.is_simulated
             end_outcome, end_reason = "fault", str(error)
             raise
         finally:
@@ -388,7 +388,7 @@ class Rig:
         """
         group = self._connected_group()
         if self._view is not None:
-            self._view.check()
+            self._view.check_heartbeat()
         try:
             control_message = group.control.poll(0.0)
         except ChildError as error:

@@ -139,7 +139,7 @@ class Series:
         self._require_disk_space()
 
     @property
-    def ticks(self) -> int:
+    def record_ticks(self) -> int:
         """Number of ticks in the record of each session."""
         return int(self._excitation.reference_rad.size)
 
@@ -238,7 +238,7 @@ class Series:
                 run_result, look_follows=quick_looks is not None and analysed_path is not None
             )
             if quick_looks is not None and analysed_path is not None:
-                quick_looks.begin(analysed_path)
+                quick_looks.add_session(analysed_path)
             if not run_result.is_successful:
                 return
 
@@ -273,7 +273,7 @@ class Series:
 def _await_quick_look(quick_looks: QuickLookQueue, rig: Rig, stop: StopRequest) -> None:
     """Wait some seconds for the quick look at the previous session before the next session."""
     deadline_s = time.monotonic() + _QUICK_LOOK_MAX_PAUSE_S
-    while quick_looks.busy and not stop.requested and time.monotonic() < deadline_s:
+    while quick_looks.is_busy and not stop.requested and time.monotonic() < deadline_s:
         rig.check_control_process()
         quick_looks.poll()
         time.sleep(_POLL_INTERVAL_S)

@@ -57,11 +57,11 @@ class WorkerClient(ABC):
 
     def poll(self) -> list[LogEvent]:
         """Process the received messages, and return the new events for the operator."""
-        self.check()
+        self.check_heartbeat()
         events, self._events = self._events, []
         return events
 
-    def check(self) -> None:
+    def check_heartbeat(self) -> None:
         """Process the received messages; restart a hung worker, or give it up."""
         if self.process_messages(0.0) and self.worker.max_silence_s is not None:
             silence_limit_s = (

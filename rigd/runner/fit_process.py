@@ -280,7 +280,7 @@ class _SessionFit:
         excitation_planner = self._search
         if self._record_ticks is not None:
             if is_drained:
-                self._request_estimate(self._record_ticks, whole=True)
+                self._request_estimate(self._record_ticks, fits_all_structures=True)
         elif (
             excitation_planner is not None
             and excitation_planner.due_tick is not None
@@ -293,14 +293,21 @@ class _SessionFit:
             request_tick = excitation_planner.due_tick + self._shared_state[StateField.HELD_TICKS]
             if self._passed_ticks >= request_tick:
                 self._request_estimate(
-                    request_tick, whole=excitation_planner.may_be_last, from_last=True
+                    request_tick,
+                    fits_all_structures=excitation_planner.may_be_last,
+                    starts_from_previous=True,
                 )
 
-    def _request_estimate(self, tick: int, *, whole: bool, from_last: bool = False) -> None:
+    def _request_estimate(
+        self, end_tick: int, *, fits_all_structures: bool, starts_from_previous: bool = False
+    ) -> None:
         """Request an estimate from the samples before a tick; see `EstimateRequest`."""
         self._request_count += 1
         self._pending = EstimateRequest(
-            _FIRST_REQUEST_ID + self._request_count, tick, whole, from_last
+            _FIRST_REQUEST_ID + self._request_count,
+            end_tick,
+            fits_all_structures,
+            starts_from_previous,
         )
         self._estimator.request(self._pending)
 
@@ -350,7 +357,9 @@ class _SessionFit:
             self._parent.send(planner_message)
         if excitation_planner.needs_early_fit:
             # This fit of all structures provides start values for the check of the whole record.
-            self._request_estimate(estimate_request.tick, whole=True, from_last=True)
+            self._request_estimate(
+                estimate_request.tick, fits_all_structures=True, starts_from_previous=True
+            )
             self._is_early_fit_pending = True
 
 

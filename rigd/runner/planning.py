@@ -86,7 +86,7 @@ class SessionPlan:
     """Warnings for the operator, one sentence each."""
     tip_in_words: str
     """Sentence on the predicted motion of the beam's free end and the linear model's validity."""
-    refused: str = ""
+    refusal_text: str = ""
     """Reasons to refuse the session, one line for each; empty if the session is allowed."""
     ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion that the control process makes after the record, such as the return to the start."""
@@ -224,7 +224,10 @@ class RigPreview:
 
 
 def excitation_for(
-    profile: Profile, kind: str, parameters: Mapping[str, Value], start_angle_rad: float = 0.0
+    profile: Profile,
+    excitation_kind: str,
+    excitation_parameters: Mapping[str, Value],
+    start_angle_rad: float = 0.0,
 ) -> Excitation:
     """Return the excitation with the given kind and parameters for the rig of a profile.
 
@@ -232,15 +235,20 @@ def excitation_for(
     ----------
     profile
         Profile of the rig.
-    kind, parameters
+    excitation_kind, excitation_parameters
         Name and parameters of the excitation, as for `rigd.excitation.make_excitation`.
     start_angle_rad
         Motor angle at the start of the session, relative to the rig's zero. Only moves need it.
     """
-    if "tip_slope_rad" in inspect.signature(KINDS[kind]).parameters:
-        parameters = {"tip_slope_rad": profile.limits.tip_slope_rad} | dict(parameters)
+    if "tip_slope_rad" in inspect.signature(KINDS[excitation_kind]).parameters:
+        excitation_parameters = {"tip_slope_rad": profile.limits.tip_slope_rad} | dict(
+            excitation_parameters
+        )
     return make_excitation(
-        kind, parameters, profile.rig.rate_hz, RigPreview(profile, start_angle_rad)
+        excitation_kind,
+        excitation_parameters,
+        profile.rig.rate_hz,
+        RigPreview(profile, start_angle_rad),
     )
 
 
@@ -276,8 +284,8 @@ def plan_session(
         accepted_row_names=accepted_row_names,
     )
     plan.offline_check_result.require_passed()
-    if plan.refused:
-        raise RefusedError(plan.refused)
+    if plan.refusal_text:
+        raise RefusedError(plan.refusal_text)
     return plan
 
 
@@ -288,7 +296,7 @@ def predict_session(
     allows_saturation: bool = False,
     accepted_row_names: Sequence[str] = (),
 ) -> SessionPlan:
-    """Return the plan of a session, whose field `refused` states why it is refused, if it is.
+    """Return the plan of a session, whose field `refusal_text` states why it is refused, if it is.
 
     Parameters
     ----------
@@ -354,7 +362,7 @@ def predict_session(
         prediction,
         warnings=tuple(warnings),
         tip_in_words=tip_in_words(prediction.tip, profile.rig.beam, excitation),
-        refused="\n".join(refusals),
+        refusal_text="\n".join(refusals),
         ending=_motion_after_record(
             closed_loop, stays_at_end=excitation.stays, is_controller_known=profile.is_loop_modelled
         ),
@@ -480,7 +488,7 @@ def plan_document(profile: Profile, excitation: Excitation, plan: SessionPlan) -
             "coupling_torque_nm": _sensor_limit_nm(profile),
             "tip_slope_rad": profile.limits.tip_slope_rad,
         },
-        "refused": plan.refused or None,
+        "refused": plan.refusal_text or None,
         "failed_checks": [
             asdict(failed_check) for failed_check in plan.offline_check_result.failed
         ],
@@ -492,9 +500,9 @@ def plan_document(profile: Profile, excitation: Excitation, plan: SessionPlan) -
     }
 
 
-def _has_amplitude(kind: str) -> bool:
+def _has_amplitude(excitation_kind: str) -> bool:
     """Return whether a kind of excitation has a parameter ``amplitude_rad``."""
-    return "amplitude_rad" in inspect.signature(KINDS[kind]).parameters
+    return "amplitude_rad" in inspect.signature(KINDS[excitation_kind]).parameters
 
 
 def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
@@ -533,7 +541,7 @@ def _peaks_and_angle(
     The response is computed in chunks, because the response of an hour would take 150 MB.
     """
     angle_rad = np.empty(reference_rad.size)
-    peaks = np.zeros(5)
+    peak_magnitudes = np.zeros(5)
     chunk_end = 0
     for chunk in closed_loop.simulate_in_chunks(reference_rad):
         chunk_begin, chunk_end = chunk_end, chunk_end + chunk.angle_rad.size
@@ -545,8 +553,10 @@ def _peaks_and_angle(
             reference_rad[chunk_begin:chunk_end] - chunk.angle_rad,
             chunk.coupling_torque_nm,
         )
-        peaks = np.maximum(peaks, [_peak_magnitude(signal) for signal in signals])
-    angle, velocity, torque, tracking_error, coupling_torque = map(float, peaks)
+        peak_magnitudes = np.maximum(
+            peak_magnitudes, [_peak_magnitude(signal) for signal in signals]
+        )
+    angle, velocity, torque, tracking_error, coupling_torque = map(float, peak_magnitudes)
     prediction = SessionPrediction(angle, velocity, torque, tracking_error, coupling_torque)
     return prediction, angle_rad
 
@@ -692,6 +702,6 @@ def _sensor_limit_nm(profile: Profile) -> float:
     )
 
 
-def _peak_magnitude(signal: RealArray) -> float:
+def _peak_magnitude(signal_values: RealArray) -> float:
     """Return the largest magnitude in an array."""
-    return float(np.max(np.abs(signal)))
+    return float(np.max(np.abs(signal_values)))

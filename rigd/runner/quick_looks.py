@@ -107,7 +107,7 @@ class QuickLookQueue:
         """Processor time in seconds that the quick look had used at `_run_time_updated_s`."""
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether a quick look is running or waiting."""
         return self._process is not None or bool(self._waiting_sessions)
 
@@ -116,7 +116,7 @@ class QuickLookQueue:
         """Run time of the present quick look in seconds, without waits for a processor."""
         return self._run_time_s
 
-    def begin(self, session_path: Path) -> None:
+    def add_session(self, session_path: Path) -> None:
         """Add a session to the queue, and start its quick look if none is running."""
         with self._lock:
             self._waiting_sessions.append(session_path)

@@ -293,7 +293,9 @@ def require_disk_space(folder: Path, excitation: Excitation, limits: Limits) -> 
         )
 
 
-def choose_session_path(folder: Path, kind: str, session_number: int | None = None) -> Path:
+def choose_session_path(
+    folder: Path, excitation_kind: str, session_number: int | None = None
+) -> Path:
     """Return an unused path for a session file, made from time, excitation and number.
 
     The file is not created. The recorder later refuses the path if a file exists there by then.
@@ -302,12 +304,12 @@ def choose_session_path(folder: Path, kind: str, session_number: int | None = No
     ----------
     folder
         Folder of the session files.
-    kind
+    excitation_kind
         Name of the excitation.
     session_number
         Number of the session in its series, or None for a single session.
     """
-    file_stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
+    file_stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{excitation_kind}"
     if session_number is not None:
         file_stem += f"-{session_number:02d}"
     session_path = folder / f"{file_stem}.mcap"
@@ -479,12 +481,12 @@ def _session_metadata(
     return metadata
 
 
-def _excitation_metadata(kind: str) -> dict[str, str]:
+def _excitation_metadata(excitation_kind: str) -> dict[str, str]:
     """Return metadata of an excitation that a package adds; empty for a built-in one.
 
     They state the package, and why the Welch method does not suit the excitation.
     """
-    declaration_and_owner = find_excitation(kind)
+    declaration_and_owner = find_excitation(excitation_kind)
     if declaration_and_owner is None:
         return {}
     declaration, owner = declaration_and_owner
@@ -496,8 +498,12 @@ def _excitation_metadata(kind: str) -> dict[str, str]:
 
 def _controller_metadata(profile: Profile) -> dict[str, str]:
     """Return metadata of a controller that a package adds; empty for the built-in one."""
-    owner = CONTROLLERS.owner(profile.control.controller)
-    return {} if owner is None else {"controller": owner.name, "controller_package": owner.label}
+    plugin_owner = CONTROLLERS.owner(profile.control.controller)
+    return (
+        {}
+        if plugin_owner is None
+        else {"controller": plugin_owner.name, "controller_package": plugin_owner.label}
+    )
 
 
 def _device_metadata(rig: RigParameters) -> dict[str, str]:

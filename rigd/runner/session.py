@@ -343,7 +343,7 @@ class SessionSupervisor:
             file_header_data = file_header(session_order, self._connection, control_message.tare)
             process_group.recorder.send(file_header_data)
             if self._fit is not None:
-                self._fit.begin(file_header_data)
+                self._fit.begin_fits(file_header_data)
             self._await_recorder(RecorderReady)
             self._shared_state[StateField.RECORD_MAY_START] = 1
             control_message = self._await_control()

@@ -40,14 +40,14 @@ class SignalBlock:
     """Peaks since the previous gauges, relative to their limits; None if these are too recent."""
 
     @property
-    def count(self) -> int:
+    def tick_count(self) -> int:
         """Number of ticks in the block."""
         return self.signals[_SIGNAL_FIELDS[0]].size
 
     @property
     def last_tick(self) -> int:
         """Number of the last tick in the block."""
-        return self.first_tick + self.count - 1
+        return self.first_tick + self.tick_count - 1
 
 
 class SignalBlockReader:

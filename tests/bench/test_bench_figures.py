@@ -43,7 +43,7 @@ def test_scheduled_ticks_are_recorded_or_missed():
     found = measurement_from_samples(
         "a", 1000.0, samples([0, 1, 5], 0), scheduled_ticks=10, cpu_percent=None, page_faults=None
     )
-    assert (found.missed, found.held_fraction) == (7, pytest.approx(0.3))
+    assert (found.missed_ticks, found.held_fraction) == (7, pytest.approx(0.3))
 
 
 def test_ticks_missed_in_a_stall_are_counted_separately():
@@ -56,7 +56,7 @@ def test_ticks_missed_in_a_stall_are_counted_separately():
         cpu_percent=None,
         page_faults=None,
     )
-    assert (found.missed, found.stall_count) == (31, 1)
+    assert (found.missed_ticks, found.stall_count) == (31, 1)
     assert found.held_fraction == pytest.approx(6 / 37)
     # The stall swallowed 30 ticks, the wake-up that was 1.9 ms late another one.
     assert found.held_fraction_between_stalls == pytest.approx(6 / 7)
@@ -69,8 +69,8 @@ def test_percentiles_are_numpys():
 
 def test_pooled_rounds_count_every_tick(measured):
     both = pool_measurements("both", [measured(held=0.5, cpu=4.0), measured(cpu=6.0)])
-    assert (both.scheduled, both.missed) == (3000, 1000)
-    assert both.lateness_us.size == 2000
+    assert (both.scheduled_ticks, both.missed_ticks) == (3000, 1000)
+    assert both.latencies_us.size == 2000
     assert both.cpu_percent == 5.0
 
 

@@ -22,11 +22,11 @@ def profile():
 
 
 def assert_accounted(found):
-    assert found.scheduled == 150
-    assert found.scheduled == found.lateness_us.size + found.missed
-    assert found.work_us.size == found.lateness_us.size
-    assert (found.lateness_us >= 0.0).all()
-    assert (found.work_us > 0.0).all()
+    assert found.scheduled_ticks == 150
+    assert found.scheduled_ticks == found.latencies_us.size + found.missed_ticks
+    assert found.execution_times_us.size == found.latencies_us.size
+    assert (found.latencies_us >= 0.0).all()
+    assert (found.execution_times_us > 0.0).all()
 
 
 def raised_priority():

@@ -18,7 +18,7 @@ def test_loop_and_cyclictest_alternate(bench, computer):
     assert [name for name, *_ in computer.ran[:3]] == ["loop alone"] * 3
     assert len(results.rounds) == 3
     assert results.latency_ratios() == (3.0, 3.0)
-    assert results.pooled_loop_measurement.scheduled == 3000
+    assert results.pooled_loop_measurement.scheduled_ticks == 3000
 
 
 def test_order_of_the_sessions(bench):
@@ -52,9 +52,13 @@ def test_search_continues_after_stalls_and_reports_them(bench, computer, measure
     def stalling(name, profile, seconds, poll, *, with_live_view=False):
         rate_hz = profile.rig.rate_hz
         found = measured(name, rate_hz=rate_hz, held=1.0 if rate_hz <= 2000.0 else 0.9)
-        found.lateness_us[0] = 30_010.0
+        found.latencies_us[0] = 30_010.0
         passed = int(0.03 * rate_hz)
-        return replace(found, missed=found.missed + passed, scheduled=found.scheduled + passed)
+        return replace(
+            found,
+            missed_ticks=found.missed_ticks + passed,
+            scheduled_ticks=found.scheduled_ticks + passed,
+        )
 
     monkeypatch.setattr("rigd.bench._program.loops.run_session", stalling)
     results = bench()

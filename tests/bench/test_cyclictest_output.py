@@ -31,7 +31,7 @@ def measure(bench, cyclictest, output, rate_hz=1000.0):
 
 def test_every_wake_up_of_the_histogram_counts(bench, cyclictest):
     found = measure(bench, cyclictest, OUTPUT)
-    delays_us, counts = np.unique(found.lateness_us, return_counts=True)
+    delays_us, counts = np.unique(found.latencies_us, return_counts=True)
     assert dict(zip(delays_us, counts, strict=True)) == {
         17.0: 300,
         18.0: 200,
@@ -39,14 +39,14 @@ def test_every_wake_up_of_the_histogram_counts(bench, cyclictest):
         2100.0: 2,
         61234.0: 1,
     }
-    assert found.work_us.size == 0
+    assert found.execution_times_us.size == 0
 
 
 def test_delays_of_whole_periods_count_as_missed_ticks(bench, cyclictest):
     found = measure(bench, cyclictest, OUTPUT)
-    assert found.missed == 2 * 2 + 61
-    assert found.scheduled == 504 + found.missed
-    assert measure(bench, cyclictest, OUTPUT, 2000.0).missed == 1 + 2 * 4 + 122
+    assert found.missed_ticks == 2 * 2 + 61
+    assert found.scheduled_ticks == 504 + found.missed_ticks
+    assert measure(bench, cyclictest, OUTPUT, 2000.0).missed_ticks == 1 + 2 * 4 + 122
 
 
 @pytest.mark.parametrize("output", ["", "# Histogram\n", "FATAL: no\n"])
@@ -59,7 +59,7 @@ def test_output_without_a_histogram_is_an_error(bench, cyclictest, output):
 
 def test_options_equal_those_of_the_loop(bench, cyclictest):
     found = measure(bench, cyclictest, "000005 000010\n", 2000.0)
-    assert found.scheduled == 10
+    assert found.scheduled_ticks == 10
     options = cyclictest.calls.read_text().split()
     assert {"--affinity=0", "--priority=80", "--policy=fifo", "--interval=500"} <= set(options)
     assert "--loops=20000" in options

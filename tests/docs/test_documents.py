@@ -160,7 +160,7 @@ def test_identifications_stay_within_the_tip_slope(kind, parameters, tmp_path):
         parameters["path"].write_text(FILES[kind])
     profile = load_profile("sim")
     plan = predict_session(profile, excitation_for(profile, kind, parameters))
-    assert not plan.refused
+    assert not plan.refusal_text
     slope_rad = plan.prediction.tip.slope_rad
     if kind == "chirp" and slope_rad > profile.limits.tip_slope_rad:
         assert slope_rad < 0.61

@@ -170,9 +170,9 @@ def run(name: str, seconds: float) -> Outcome:
     )
     return Outcome(
         name,
-        missed=found.missed,
+        missed=found.missed_ticks,
         missed_between_stalls=round((1.0 - found.held_fraction_between_stalls) * scheduled),
-        lost=scheduled - found.missed - len(samples),
+        lost=scheduled - found.missed_ticks - len(samples),
         recorded=len(samples),
         publisher_mb=publisher_mb,
         server_mb=server_mb,

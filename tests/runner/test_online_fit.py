@@ -42,7 +42,7 @@ def test_reason_and_result_agree(ended, std, reached, reason):
     group.__getitem__().messages.return_value = messages
     search = SimpleNamespace(targets=(parse_target("damping", "1%"),))
     fit = FitClient(group, MagicMock(), MagicMock(), search)
-    fit.begin(MagicMock())
+    fit.begin_fits(MagicMock())
     found = fit.finish(9000, lambda: None)["search"]
     assert found["reached"] is reached
     assert found["reason"].startswith(reason)
@@ -87,7 +87,7 @@ def test_result_is_unknown_without_a_fit_of_the_record(
     group.__getitem__().messages.side_effect = read_messages
     search = SimpleNamespace(targets=(parse_target("damping", "1%"),))
     fit = FitClient(group, MagicMock(), MagicMock(), search)
-    fit.begin(MagicMock())
+    fit.begin_fits(MagicMock())
     found = fit.finish(9000, lambda: None)["search"]
     assert found["reached"] is reached
     assert found["reason"] == fit.unmet_reason

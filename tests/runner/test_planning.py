@@ -95,7 +95,7 @@ def test_largest_amplitude_is_accepted_and_a_larger_one_refused(profile, make, f
     assert largest_amplitude(profile, make(1e-3), allows_saturation=force) == pytest.approx(
         largest_rad, rel=0.01
     )
-    assert not predict_session(profile, make(largest_rad), allows_saturation=force).refused
+    assert not predict_session(profile, make(largest_rad), allows_saturation=force).refusal_text
     with pytest.raises(RefusedError, match=f"lower the amplitude to {largest_rad:g} rad"):
         plan_session(profile, make(1.011 * largest_rad), allows_saturation=force)
 
@@ -104,7 +104,7 @@ def test_no_largest_amplitude_without_an_amplitude(profile, tmp_path):
     path = tmp_path / "reference.csv"
     path.write_text("0\n3.0\n")
     far = from_csv(path, rate_hz=1000.0, ring_down_s=1.0)
-    assert "lower the amplitude.\n" in predict_session(profile, far).refused
+    assert "lower the amplitude.\n" in predict_session(profile, far).refusal_text
     for excitation in (far, hold(rate_hz=1000.0, duration_s=1.0)):
         assert largest_amplitude(profile, excitation) is None
 

@@ -60,14 +60,14 @@ def queue(tmp_path, monkeypatch, started):
     queue.results = results
     yield queue
     queue.close()
-    assert not queue.busy
+    assert not queue.is_busy
     assert not started()
 
 
 def await_results(queue):
     def idle():
         queue.poll()
-        return not queue.busy
+        return not queue.is_busy
 
     assert eventually(idle)
     return queue.results
@@ -81,7 +81,7 @@ def run_time_s(queue):
 def test_quick_looks_run_one_after_the_other(queue, tmp_path, started):
     paths = [tmp_path / f"{name}.mcap" for name in ("a", "b")]
     for path in paths:
-        queue.begin(path)
+        queue.add_session(path)
         assert len(started()) == 1
     first, second = await_results(queue)
     assert [first.session_path, second.session_path] == paths
@@ -99,7 +99,7 @@ def test_quick_looks_run_one_after_the_other(queue, tmp_path, started):
     ],
 )
 def test_failed_quick_look_states_its_reason(queue, tmp_path, name, error):
-    queue.begin(tmp_path / f"{name}.mcap")
+    queue.add_session(tmp_path / f"{name}.mcap")
     (result,) = await_results(queue)
     assert (result.path, result.report_content) == (None, None)
     assert result.error.endswith(error)
@@ -107,12 +107,12 @@ def test_failed_quick_look_states_its_reason(queue, tmp_path, name, error):
 
 
 def test_no_quick_look_runs_during_a_session(queue, tmp_path, started):
-    queue.begin(tmp_path / "waits.mcap")
+    queue.add_session(tmp_path / "waits.mcap")
     (pid,) = started()
     with queue.suspended():
         assert eventually(lambda: state_of(Path(f"/proc/{pid}")) == "T")
         (tmp_path / "waits.go").touch()
-        queue.begin(tmp_path / "next.mcap")
+        queue.add_session(tmp_path / "next.mcap")
         time.sleep(0.1)
         queue.poll()
         assert started() == [pid]
@@ -123,7 +123,7 @@ def test_no_quick_look_runs_during_a_session(queue, tmp_path, started):
 
 def test_hanging_quick_look_is_killed_except_for_session_time(queue, tmp_path, monkeypatch):
     monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.2)
-    queue.begin(tmp_path / "hangs.mcap")
+    queue.add_session(tmp_path / "hangs.mcap")
     with queue.suspended():
         time.sleep(0.25)
     queue.poll()
@@ -136,11 +136,11 @@ def test_run_time_excludes_the_wait_for_a_processor(queue, tmp_path, monkeypatch
     monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
     used_s = 0.0
     monkeypatch.setattr(quick_looks, "processor_use", lambda _: (True, used_s))
-    queue.begin(tmp_path / "waits.mcap")
+    queue.add_session(tmp_path / "waits.mcap")
     for _ in range(3):
         time.sleep(0.05)
         queue.poll()
-    assert (queue.busy, queue.results, queue.run_time_s) == (True, [], 0.0)
+    assert (queue.is_busy, queue.results, queue.run_time_s) == (True, [], 0.0)
     used_s = 0.06
     time.sleep(0.06)
     queue.poll()
@@ -164,7 +164,7 @@ def test_no_wait_for_a_killed_quick_look(queue, tmp_path, monkeypatch):
     # As on a busy computer, it does not end in time; the timer kills it if the test fails.
     monkeypatch.setattr(ChildProcess, "kill", lambda _: None)
     for end in (queue.poll, queue.close):
-        queue.begin(tmp_path / "hangs.mcap")
+        queue.add_session(tmp_path / "hangs.mcap")
         process = queue._process
         late = threading.Timer(5.0, os.kill, (process.pid, signal.SIGKILL))
         late.start()
@@ -186,7 +186,7 @@ def test_no_wait_for_a_killed_quick_look(queue, tmp_path, monkeypatch):
 def test_oldest_of_too_many_quick_looks_are_skipped(queue, tmp_path):
     names = ("waits", "a", "b", "c", "d", "e")
     for name in names:
-        queue.begin(tmp_path / f"{name}.mcap")
+        queue.add_session(tmp_path / f"{name}.mcap")
     assert [(each.session_path.stem, each.error) for each in queue.results] == [
         ("a", "skipped in favour of later sessions."),
         ("b", "skipped in favour of later sessions."),
@@ -203,9 +203,9 @@ def test_oldest_of_too_many_quick_looks_are_skipped(queue, tmp_path):
 
 
 def test_close_ends_a_suspended_quick_look(queue, tmp_path, started):
-    queue.begin(tmp_path / "hangs.mcap")
+    queue.add_session(tmp_path / "hangs.mcap")
     os.kill(started()[0], signal.SIGSTOP)
-    queue.begin(tmp_path / "a.mcap")
+    queue.add_session(tmp_path / "a.mcap")
     queue.close()
     assert started() == []
     assert queue.results == []

@@ -140,10 +140,10 @@ class FakeQuickLookQueue:
         self.calls, self.left = calls, 0
 
     @property
-    def busy(self):
+    def is_busy(self):
         return self.left > 0
 
-    def begin(self, path):
+    def add_session(self, path):
         self.calls.append(("look", path.stem[-2:]))
         self.left = 3
 

@@ -33,7 +33,7 @@ def test_identification_beyond_the_limit_is_refused_with_remedies(profile, kind)
     excitation = MAKE[kind](0.12)
     refused = predict_session(
         profile, excitation, allows_saturation=True
-    ).refused  # no torque is concerned
+    ).refusal_text  # no torque is concerned
     (line,) = [each for each in refused.splitlines() if "tip slope" in each]
     slope_rad, limit_rad = map(float, re.search(r"of (\S+) rad exceeds (\S+) rad", line).groups())
     assert slope_rad > limit_rad == SMALL_SLOPE_RAD
@@ -42,18 +42,18 @@ def test_identification_beyond_the_limit_is_refused_with_remedies(profile, kind)
     assert lower_rad == largest_amplitude(profile, excitation, allows_saturation=True)
     lower = predict_session(profile, MAKE[kind](lower_rad), allows_saturation=True)
     assert 0.95 * limit_rad < lower.prediction.tip.slope_rad <= limit_rad
-    assert not lower.refused
+    assert not lower.refusal_text
     allowed_rad = float(re.search(r"--tip-slope (\S+)", line)[1])
     allowed = with_tip_slope(profile, allowed_rad)
-    assert "tip slope" not in predict_session(allowed, excitation).refused
-    assert predict_session(with_tip_slope(profile, 0.99 * slope_rad), excitation).refused
+    assert "tip slope" not in predict_session(allowed, excitation).refusal_text
+    assert predict_session(with_tip_slope(profile, 0.99 * slope_rad), excitation).refusal_text
 
 
 def test_chirp_is_exempt_up_to_the_reference_amplitude(profile):
     for amplitude_rad, exempt in ((0.025, True), (0.0251, False)):
         excitation = chirp(rate_hz=1000.0, amplitude_rad=amplitude_rad)
         plan = predict_session(profile, excitation)
-        assert bool(plan.refused) == (not exempt)
+        assert bool(plan.refusal_text) == (not exempt)
         assert ("is not refused for it" in plan.tip_in_words) == exempt
         assert "error at most 12 %" in plan.tip_in_words
     # The offered amplitude is within the range of the linear model.
@@ -64,10 +64,10 @@ def test_chirp_is_exempt_up_to_the_reference_amplitude(profile):
 def test_file_beyond_the_limit_is_refused_with_a_factor(profile, tmp_path):
     path = tmp_path / "reference.csv"
     path.write_text("\n".join(map(str, 0.1 * np.sin(np.arange(8000) * 2.5 * 2e-3 * np.pi))))
-    refused = predict_session(profile, from_csv(path, rate_hz=1000.0)).refused
+    refused = predict_session(profile, from_csv(path, rate_hz=1000.0)).refusal_text
     factor = float(re.search(r"tip slope .* lower the amplitude to (\S+) of it", refused)[1])
     path.write_text("\n".join(str(factor * float(each)) for each in path.read_text().split()))
-    assert not predict_session(profile, from_csv(path, rate_hz=1000.0)).refused
+    assert not predict_session(profile, from_csv(path, rate_hz=1000.0)).refusal_text
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_file_beyond_the_limit_is_refused_with_a_factor(profile, tmp_path):
 def test_moves_and_touches_state_their_slope(profile, kind, options, meaning):
     plan = predict_session(profile, excitation_for(profile, kind, options))
     assert plan.prediction.tip.slope_rad > SMALL_SLOPE_RAD
-    assert "slope" not in plan.refused
+    assert "slope" not in plan.refusal_text
     assert f"slope {plan.prediction.tip.slope_rad:.2g} rad" in plan.tip_in_words
     assert meaning in plan.tip_in_words
     assert "At slopes above" in plan.tip_in_words
@@ -91,7 +91,7 @@ def test_motor_identification_is_independent_of_the_model(profile):
     excitation = speeds_session(profile, torque_percent=40.0, stroke_rad=0.8)
     plan = predict_session(profile, excitation)
     assert plan.prediction.tip.slope_rad > SMALL_SLOPE_RAD
-    assert not plan.refused
+    assert not plan.refusal_text
     assert "does not depend on it" in plan.tip_in_words
     assert "amplitude" not in plan.tip_in_words
 
