@@ -159,7 +159,7 @@ _MIN_REALTIME_FRACTION = 0.95
 
 
 def machine_rows(
-    settings: RealtimeSettings, root: Path = Path("/"), kernel_version: str = ""
+    settings: RealtimeSettings, file_system_root: Path = Path("/"), kernel_version: str = ""
 ) -> Iterator[CheckRow]:
     """Yield check results on settings of this computer that can delay ticks, with advice.
 
@@ -167,25 +167,26 @@ def machine_rows(
     ----------
     settings
         Real-time settings of the profile.
-    root
+    file_system_root
         Root of the file system from which the settings are read.
     kernel_version
         Version of the kernel as in ``uname -v``, or "" for that of this computer.
     """
     kernel_version = kernel_version or platform.version()
-    yield _kernel_row(root, kernel_version)
-    yield _virtual_machine_row(root)
-    yield _isolated_core_row(settings, root)
-    yield _governor_row(root)
-    yield _clock_row(root)
+    yield _kernel_row(file_system_root, kernel_version)
+    yield _virtual_machine_row(file_system_root)
+    yield _isolated_core_row(settings, file_system_root)
+    yield _governor_row(file_system_root)
+    yield _clock_row(file_system_root)
     yield _wall_clock_row()
-    yield _throttling_row(settings, root)
+    yield _throttling_row(settings, file_system_root)
 
 
-def _kernel_row(root: Path, kernel_version: str) -> CheckRow:
+def _kernel_row(file_system_root: Path, kernel_version: str) -> CheckRow:
     """Return the check result on whether the kernel is a real-time kernel."""
     is_preemptible = (
-        "PREEMPT_RT" in kernel_version or _read_or_empty(root / _REALTIME_KERNEL_FILE) == "1"
+        "PREEMPT_RT" in kernel_version
+        or _read_or_empty(file_system_root / _REALTIME_KERNEL_FILE) == "1"
     )
     if is_preemptible:
         found_text = "PREEMPT_RT"
@@ -205,11 +206,11 @@ def _kernel_row(root: Path, kernel_version: str) -> CheckRow:
     )
 
 
-def _virtual_machine_row(root: Path) -> CheckRow:
+def _virtual_machine_row(file_system_root: Path) -> CheckRow:
     """Return the check result on whether this computer is a virtual machine."""
-    cpu_info_words = set(_read_or_empty(root / "proc/cpuinfo").split())
+    cpu_info_words = set(_read_or_empty(file_system_root / "proc/cpuinfo").split())
     is_virtual_machine = "hypervisor" in cpu_info_words or bool(
-        _read_or_empty(root / "sys/hypervisor/type")
+        _read_or_empty(file_system_root / "sys/hypervisor/type")
     )
     return CheckRow(
         _COMPUTER_GROUP,
@@ -224,9 +225,9 @@ def _virtual_machine_row(root: Path) -> CheckRow:
     )
 
 
-def _isolated_core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
+def _isolated_core_row(settings: RealtimeSettings, file_system_root: Path) -> CheckRow:
     """Return the check result on whether the loop's core is isolated from other programs."""
-    isolated_core_numbers = isolated_cores(root)
+    isolated_core_numbers = isolated_cores(file_system_root)
     cores_text = ", ".join(map(str, sorted(isolated_core_numbers)))
     is_loop_core_isolated = (
         settings.cpu in isolated_core_numbers if settings.cpu >= 0 else bool(isolated_core_numbers)
@@ -262,11 +263,13 @@ def _isolation_advice(last_core: int) -> str:
     )
 
 
-def _governor_row(root: Path) -> CheckRow:
+def _governor_row(file_system_root: Path) -> CheckRow:
     """Return the check result on the governor of the processor's frequency."""
     governors = {
         _read_or_empty(governor_file)
-        for governor_file in sorted((root / _CPU_FOLDER).glob("cpu[0-9]*/cpufreq/scaling_governor"))
+        for governor_file in sorted(
+            (file_system_root / _CPU_FOLDER).glob("cpu[0-9]*/cpufreq/scaling_governor")
+        )
     }
     is_slow_governor = bool(governors - {"performance"})
     return CheckRow(
@@ -282,9 +285,9 @@ def _governor_row(root: Path) -> CheckRow:
     )
 
 
-def _clock_row(root: Path) -> CheckRow:
+def _clock_row(file_system_root: Path) -> CheckRow:
     """Return the check result on the kernel's clock source."""
-    clock_source = _read_or_empty(root / _CLOCK_SOURCE_FILE)
+    clock_source = _read_or_empty(file_system_root / _CLOCK_SOURCE_FILE)
     # Architectures other than x86 have a fast counter of their own.
     is_fast_clock = clock_source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
     return CheckRow(
@@ -316,10 +319,10 @@ def _wall_clock_row() -> CheckRow:
     )
 
 
-def _throttling_row(settings: RealtimeSettings, root: Path) -> CheckRow:
+def _throttling_row(settings: RealtimeSettings, file_system_root: Path) -> CheckRow:
     """Return the result on the fraction of time that the kernel leaves to real-time processes."""
-    realtime_runtime_us = _read_number(root / _REALTIME_RUNTIME_FILE, -1)
-    realtime_period_us = _read_number(root / _REALTIME_PERIOD_FILE, 1_000_000)
+    realtime_runtime_us = _read_number(file_system_root / _REALTIME_RUNTIME_FILE, -1)
+    realtime_period_us = _read_number(file_system_root / _REALTIME_PERIOD_FILE, 1_000_000)
     realtime_fraction = (
         realtime_runtime_us / realtime_period_us if realtime_runtime_us >= 0 else 1.0
     )

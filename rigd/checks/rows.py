@@ -81,13 +81,13 @@ EDS_CONSEQUENCES = {
 
 
 def print_check_table(
-    rows: Sequence[CheckRow], consequence_by_verdict: Mapping[str, str] = RIG_CONSEQUENCES
+    check_rows: Sequence[CheckRow], consequence_by_verdict: Mapping[str, str] = RIG_CONSEQUENCES
 ) -> None:
     """Print the rows as a table, then their details and the verdict, to standard output.
 
     Parameters
     ----------
-    rows
+    check_rows
         Rows; those of a group are adjacent.
     consequence_by_verdict
         Map from the verdict over all rows to its consequence, which is printed under the table.
@@ -104,7 +104,7 @@ def print_check_table(
     table.add_column("", no_wrap=True, width=7)
     shown_group = ""
     shown_row_names: set[str] = set()
-    for row in rows:
+    for row in check_rows:
         if row.group != shown_group:
             shown_group = row.group
             if table.row_count:
@@ -123,17 +123,17 @@ def print_check_table(
         )
     console = Console(highlight=False)
     console.print(table)
-    for row in rows:
+    for row in check_rows:
         if row.detail:
             console.print(Text(row.detail))
             console.print()
-    console.print(Text(_verdict_line(rows, consequence_by_verdict), style="bold"))
+    console.print(Text(_verdict_line(check_rows, consequence_by_verdict), style="bold"))
 
 
-def _verdict_line(rows: Sequence[CheckRow], consequence_by_verdict: Mapping[str, str]) -> str:
+def _verdict_line(check_rows: Sequence[CheckRow], consequence_by_verdict: Mapping[str, str]) -> str:
     """Return the line under the table: verdict, numbers of rows by result, and consequence."""
     row_count_by_verdict = {
-        verdict: sum(row.verdict is verdict for row in rows) for verdict in CheckResult
+        verdict: sum(row.verdict is verdict for row in check_rows) for verdict in CheckResult
     }
     row_counts_text = (
         f"failed: {row_count_by_verdict[CheckResult.FAIL]}, warnings: "
@@ -141,5 +141,5 @@ def _verdict_line(rows: Sequence[CheckRow], consequence_by_verdict: Mapping[str,
         f"ok: {row_count_by_verdict[CheckResult.OK]}, skipped: "
         f"{row_count_by_verdict[CheckResult.SKIPPED]}"
     )
-    verdict = overall(rows)
+    verdict = overall(check_rows)
     return f"Verdict: {verdict} ({row_counts_text}): {consequence_by_verdict[verdict]}."

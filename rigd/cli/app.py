@@ -28,7 +28,7 @@ def _show_version(requested: bool) -> None:
         raise typer.Exit
 
 
-def before_a_command(
+def process_global_options(
     version: Annotated[
         bool,
         typer.Option(
@@ -48,7 +48,7 @@ _COMMANDS_BY_SECTION: Final = {
 }
 """Names of the commands in each section of the help."""
 _OTHER_COMMANDS_TITLE: Final = "Other commands"
-"""Title of the section of the help with all commands that are not in `_SECTIONS`."""
+"""Title of the section of the help with all commands that are not in `_COMMANDS_BY_SECTION`."""
 
 
 class RigdGroup(TyperGroup):
@@ -102,7 +102,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.callback()(before_a_command)
+app.callback()(process_global_options)
 # In the order in which an operator meets them.
 app.command()(check)
 app.add_typer(run_app, name="run")

@@ -76,12 +76,12 @@ def list_sessions(
     from rigd.library import list_sessions as sessions_of
     from rigd.library.trend import mode_trends
 
-    rows: list[SessionRow] = []
+    session_rows: list[SessionRow] = []
     if not folders:
         folders = [SESSIONS_FOLDER] if SESSIONS_FOLDER.exists() else []
     for folder in folders:
         with task_progress(folder.name) as on_progress:
-            rows += sessions_of(
+            session_rows += sessions_of(
                 folder,
                 specimen=specimen,
                 operator=operator,
@@ -91,11 +91,11 @@ def list_sessions(
                 until=until,
                 on_progress=on_progress,
             )
-    rows.sort(key=lambda row: row.start_utc_ns or 0, reverse=True)
+    session_rows.sort(key=lambda row: row.start_utc_ns or 0, reverse=True)
     if trend:
-        trends = mode_trends(_sessions_of_one_specimen(rows))
+        trends = mode_trends(_sessions_of_one_specimen(session_rows))
     if as_json:
-        json_document: dict[str, Any] = {"sessions": [row.as_dict() for row in rows]}
+        json_document: dict[str, Any] = {"sessions": [row.as_dict() for row in session_rows]}
         if trend:
             json_document["trends"] = [mode_trend.as_dict() for mode_trend in trends]
         typer.echo(json.dumps(json_document))
@@ -104,7 +104,7 @@ def list_sessions(
     elif not folders:
         typer.echo(_FIRST_SESSION_TEXT)
     else:
-        typer.echo("\n".join(_session_lines(rows)))
+        typer.echo("\n".join(_session_lines(session_rows)))
 
 
 def specimens() -> None:

@@ -23,7 +23,7 @@ _MAX_PATH_CHARACTERS = 4096
 """Maximum number of characters of a path among the parameters."""
 _MAX_TEXT_CHARACTERS = 1000
 """Maximum number of characters of a text among the parameters."""
-_MAX_SHOWN_CHARACTERS = 60
+_MAX_SHOWN_VALUE_CHARACTERS = 60
 """Maximum number of characters of a value in an error message."""
 
 _MAX_ID_CHARACTERS = 64
@@ -234,7 +234,8 @@ def _first_error_sentence(error: ValidationError) -> str:
         return f"id is a whole number or a text of at most {_MAX_ID_CHARACTERS} characters."
     field_name = (
         ".".join(
-            str(location_part)[:_MAX_SHOWN_CHARACTERS] for location_part in first_error["loc"][1:]
+            str(location_part)[:_MAX_SHOWN_VALUE_CHARACTERS]
+            for location_part in first_error["loc"][1:]
         )
         or "The request"
     )
@@ -342,6 +343,6 @@ def _shown_value(json_value: object) -> str:
         json_text = "..."
     return (
         json_text
-        if len(json_text) <= _MAX_SHOWN_CHARACTERS
-        else f"{json_text[:_MAX_SHOWN_CHARACTERS]}..."
+        if len(json_text) <= _MAX_SHOWN_VALUE_CHARACTERS
+        else f"{json_text[:_MAX_SHOWN_VALUE_CHARACTERS]}..."
     )

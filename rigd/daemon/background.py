@@ -26,7 +26,7 @@ from rigd.runtime import ignore_end_signals as ignore_signals
 
 _JOB_TIMEOUT_S: Final = 50.0
 """Maximum time in seconds for a job, below the client's timeout so that the client gets a reply."""
-_LIGHT_RECORD_S: Final = 300.0
+_MAX_LIGHT_RECORD_S: Final = 300.0
 """Duration in seconds of the longest record that is light to plan, in half a second and 100 MB."""
 
 Result = TypeVar("Result")
@@ -145,7 +145,7 @@ class PlanJob:
             for parameter_name, parameter_value in parameter_items
             if parameter_name.endswith("_s")
         )
-        return total_duration_s > _LIGHT_RECORD_S or any(
+        return total_duration_s > _MAX_LIGHT_RECORD_S or any(
             isinstance(parameter_value, Path) for _, parameter_value in parameter_items
         )
 

@@ -22,7 +22,7 @@ from rigd.profile import Profile
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_MAX_MODES = 6
+_MAX_MOVE_MODES = 6
 """Maximum number of modes whose vibration a move suppresses; higher modes are negligible."""
 _DEFAULT_FREQUENCY_UNCERTAINTY = 0.01
 """Assumed relative uncertainty of the mode frequencies of the profile's beam."""
@@ -139,7 +139,7 @@ def mode_poles(closed_loop: ClosedLoop) -> tuple[ComplexArray, ComplexArray]:
     """
     loop_model = closed_loop.model
     assert loop_model.plant is not None
-    locked_hub_poles = loop_model.plant.poles(clamped_free_eigenvalues(_MAX_MODES))[:, 0]
+    locked_hub_poles = loop_model.plant.poles(clamped_free_eigenvalues(_MAX_MOVE_MODES))[:, 0]
     locked_hub_poles = locked_hub_poles[
         (locked_hub_poles.imag > 0.0)
         & (np.abs(locked_hub_poles) < 0.5 * math.pi * loop_model.rate_hz)

@@ -18,7 +18,7 @@ from rigd.engine.workers import CONTROL, LIVE, PROCESSES, RECORDER, Worker
 if TYPE_CHECKING:
     from rigd.engine.channels import Channels
 
-_SHARED_MEMORY_FILES = 6
+_SHARED_MEMORY_FILE_COUNT = 6
 """Number of shared memory files."""
 
 
@@ -59,7 +59,7 @@ class ProcessGroup:
         self._children: dict[Worker, ChildProcess] = {}
         self._heartbeats: dict[Worker, Heartbeat] = {}
         try:
-            while len(self._fds) < _SHARED_MEMORY_FILES:
+            while len(self._fds) < _SHARED_MEMORY_FILE_COUNT:
                 self._fds.append(shared_memory_fd())
             wanted_processes = {CONTROL, RECORDER, *self._extra_processes} | (
                 {LIVE} if with_live_view else set()

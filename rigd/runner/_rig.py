@@ -94,7 +94,7 @@ class Rig:
     ) -> None:
         self._profile = profile
         self._uses_virtual_clock = uses_virtual_clock
-        self._live = with_live_view
+        self._with_live_view = with_live_view
         self._group = group
         self._connection: DevicesConnected | None = None
         self._view: LiveViewClient | None = None
@@ -159,7 +159,7 @@ class Rig:
         try:
             # For processes that are started here, it is not yet known which sessions follow.
             may_be_observed = self._group is None
-            group = self._group = self._group or ProcessGroup(with_live_view=self._live)
+            group = self._group = self._group or ProcessGroup(with_live_view=self._with_live_view)
             granted_settings = self._raise_priority(group)
             if reset_fault:
                 self._reset_fault(target)

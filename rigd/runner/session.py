@@ -48,7 +48,7 @@ _DRIVE_TIMEOUT_S = 30.0
 """Maximum time in seconds for enabling or disabling a drive, which may be slow."""
 _RECORDER_START_TIMEOUT_S = 30.0
 """Maximum time in seconds for the recorder to start on a busy computer, before any motion."""
-_MAX_FILE_NAMES = 100
+_MAX_FILE_NAME_ATTEMPTS = 100
 """Maximum number of names that are tried for a session file."""
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
@@ -361,7 +361,7 @@ class SessionSupervisor:
         """Start the recorder, which creates the session file; change the name if it is used."""
         process_group = self._group
         realtime_settings = None if self._is_virtual_clock else self._order.profile.realtime
-        for _ in range(_MAX_FILE_NAMES):
+        for _ in range(_MAX_FILE_NAME_ATTEMPTS):
             recorder_job = RecorderJob(
                 self._order.path, process_group.channels.specs, realtime_settings
             )

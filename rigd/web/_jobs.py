@@ -15,7 +15,7 @@ from rigd.engine.workers import REPORT
 
 Document = dict[str, Any]
 
-MAX_JOBS: Final = 16
+MAX_WAITING_JOBS: Final = 16
 """Largest number of waiting jobs."""
 _POLL_PERIOD_S: Final = 0.2
 """Interval in seconds at which waiting jobs are polled."""
@@ -78,7 +78,7 @@ class Jobs:
         self.paused = True  # until the daemon reports that no session runs
         self._folder = folder
         self._publish = publish
-        self._queue: asyncio.Queue[AnalysisJob] = asyncio.Queue(MAX_JOBS)
+        self._queue: asyncio.Queue[AnalysisJob] = asyncio.Queue(MAX_WAITING_JOBS)
         self._unfinished: dict[int, AnalysisJob] = {}
         self._count = 0
 
@@ -103,7 +103,9 @@ class Jobs:
         try:
             self._queue.put_nowait(job)
         except asyncio.QueueFull:
-            raise JobError(f"{MAX_JOBS} jobs are waiting already; try again later.") from None
+            raise JobError(
+                f"{MAX_WAITING_JOBS} jobs are waiting already; try again later."
+            ) from None
         self._unfinished[job.number] = job
         self._publish_state(job)
         return job

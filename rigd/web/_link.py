@@ -45,8 +45,8 @@ class BusyError(Exception):
 class DaemonLink:
     """Receives the events of a daemon, and sends requests to it.
 
-    `on_message` receives each event and each status reply, `on_lost` the reason when no messages
-    arrive any more.
+    `on_message` receives each event and each status reply, `on_connection_lost` the reason when no
+    messages arrive any more.
     """
 
     def __init__(

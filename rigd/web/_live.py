@@ -12,7 +12,7 @@ from aiohttp import WSMsgType, web
 
 Document = dict[str, Any]
 
-MAX_PAGES: Final = 24
+MAX_OPEN_PAGES: Final = 24
 """Largest number of open pages."""
 _MAX_QUEUED_MESSAGES: Final = 200
 """Largest number of queued messages of a page, about 5 s of a session.
@@ -108,8 +108,10 @@ class Pages:
         `stop_session`, which stops the session, is called for each message ``stop`` of the page;
         its result is sent to the page.
         """
-        if len(self._pages) >= MAX_PAGES:
-            raise web.HTTPServiceUnavailable(reason=f"There are {MAX_PAGES} open pages already.")
+        if len(self._pages) >= MAX_OPEN_PAGES:
+            raise web.HTTPServiceUnavailable(
+                reason=f"There are {MAX_OPEN_PAGES} open pages already."
+            )
         web_socket = web.WebSocketResponse(
             heartbeat=_PING_PERIOD_S, compress=False, max_msg_size=_MAX_MESSAGE_BYTES
         )

@@ -51,7 +51,7 @@ _KEEP_ALIVE_S: Final = 15.0
 """Seconds for which an idle connection remains open."""
 _LINGERING_TIME_S: Final = 1.0
 """Seconds for which the server reads what remains of a request before it disconnects."""
-_RESPONSE_PERIOD_S: Final = 1.0
+_FREQUENCY_RESPONSE_PERIOD_S: Final = 1.0
 """Interval in seconds at which the frequency response of a running session is sent."""
 _LAST_MESSAGES_TIMEOUT_S: Final = 0.3
 """Seconds for the last messages to reach the pages before the process ends."""
@@ -292,7 +292,7 @@ class OperatorPageServer:
     async def _send_responses(self) -> None:
         """Send the frequency response of the running session periodically, until cancelled."""
         while True:
-            await asyncio.sleep(_RESPONSE_PERIOD_S)
+            await asyncio.sleep(_FREQUENCY_RESPONSE_PERIOD_S)
             if self._response is not None and self.pages:
                 shown_response = self._response.response_message()
                 self._shown = shown_response or self._shown

@@ -207,13 +207,13 @@ def served(tmp_path_factory):
     server.close()
 
 
-JobError, Jobs, MAX_JOBS = _jobs.JobError, _jobs.Jobs, _jobs.MAX_JOBS
+JobError, Jobs, MAX_JOBS = _jobs.JobError, _jobs.Jobs, _jobs.MAX_WAITING_JOBS
 
 _PARTS = {
     "silent_s": (_access, "_FIRST_REQUEST_TIMEOUT_S"),
     "read_s": (_access, "_BODY_TIMEOUT_S"),
     "most_connections": (_access, "_MAX_OPEN_CONNECTIONS"),
-    "most_pages": (_live, "MAX_PAGES"),
+    "most_pages": (_live, "MAX_OPEN_PAGES"),
     "most_waiting": (_live, "_MAX_QUEUED_MESSAGES"),
     "list_sessions": (_library, "list_sessions"),
     "response": (_server, "SessionResponse"),
