@@ -203,7 +203,7 @@ def own_daemon_sockets() -> list[Path]:
     return socket_paths
 
 
-def daemon_pid_and_uid(path: Path) -> tuple[int, int] | None:
+def daemon_pid_and_uid(daemon_socket_path: Path) -> tuple[int, int] | None:
     """Return process id and user id of the process that listens on a socket.
 
     The result is None if the socket's queue of waiting connections is full.
@@ -220,7 +220,7 @@ def daemon_pid_and_uid(path: Path) -> tuple[int, int] | None:
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe_socket:
         try:
-            probe_socket.connect(os.fspath(path))
+            probe_socket.connect(os.fspath(daemon_socket_path))
         except BlockingIOError:
             return None
         return peer_pid_and_uid(probe_socket)

@@ -98,10 +98,11 @@ def run_in_foreground(
         Name or path of the profile.
     folder
         Folder of the session files; created if it does not exist.
-    session_count, seed, notes, uses_virtual_clock, with_live_view, allows_saturation,
-    accepted_row_names, force_hardware
+    session_count, seed, notes, allows_saturation, accepted_row_names
         Options of the command line. The rig is connected once for all sessions. Each session waits
         until the beam is at rest.
+    uses_virtual_clock, with_live_view, force_hardware
+        Options ``--fast``, ``--live`` and ``--hardware`` of the command line.
     quiet_stdout
         Print all text to standard error, because standard output is reserved for a JSON document.
     with_quick_looks
