@@ -286,18 +286,23 @@ def _frequency_limits(trend: "ModeTrend") -> tuple[float, float]:
     return min(interval_ends_hz), max(interval_ends_hz)
 
 
-def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> str:
+def _interval_plot(point: "TrendPoint", axis_begin_hz: float, axis_end_hz: float) -> str:
     """Return a text plot, one line, of the frequency of a session's mode with its interval.
 
-    The axis extends from `lowest_hz` to `highest_hz`.
+    The axis extends from `axis_begin_hz` to `axis_end_hz`.
     """
-    if highest_hz <= lowest_hz:
+    if axis_end_hz <= axis_begin_hz:
         return ""
 
     def plot_column(frequency_hz: float) -> int:
         return min(
             max(
-                round((frequency_hz - lowest_hz) / (highest_hz - lowest_hz) * (_PLOT_WIDTH - 1)), 0
+                round(
+                    (frequency_hz - axis_begin_hz)
+                    / (axis_end_hz - axis_begin_hz)
+                    * (_PLOT_WIDTH - 1)
+                ),
+                0,
             ),
             _PLOT_WIDTH - 1,
         )
@@ -319,11 +324,11 @@ def _quantity_text(estimate: "Estimate", display_factor: float = 1.0) -> str:
     return estimate.text(display_factor) + (" ?" if estimate.flag else "")
 
 
-def _change_text(change: "Change | None", first_value: float) -> str:
+def _change_text(change: "Change | None", first_session_value: float) -> str:
     """Format the change of a mode's value in percent of the first; "*" marks a significant one."""
-    if change is None or first_value == 0:
+    if change is None or first_session_value == 0:
         return ""
-    change_percent = 100 * change.difference / first_value
+    change_percent = 100 * change.difference / first_session_value
     return f"{change_percent:+.2g} %{' *' if change.significant else ''}"
 
 

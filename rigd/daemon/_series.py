@@ -129,8 +129,8 @@ class SeriesReporter:
     def on_message(self, level: str, message_text: str) -> None:
         self._report(level, message_text, is_notable=True)
 
-    def on_live_view(self, view_text: str) -> None:
-        self._report("info", view_text)
+    def on_live_view(self, live_view_text: str) -> None:
+        self._report("info", live_view_text)
 
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         for event in events:

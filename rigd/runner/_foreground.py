@@ -233,10 +233,10 @@ class _TerminalProgress:
     def on_message(self, level: str, message_text: str) -> None:
         self._print(f"Warning: {message_text}" if level == "warning" else message_text)
 
-    def on_live_view(self, view_text: str) -> None:
-        if view_text != self._last_view_text:
-            self._print(view_text)
-            self._last_view_text = view_text
+    def on_live_view(self, live_view_text: str) -> None:
+        if live_view_text != self._last_view_text:
+            self._print(live_view_text)
+            self._last_view_text = live_view_text
 
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:
         assert self._progress_line is not None

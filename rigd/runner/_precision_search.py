@@ -348,11 +348,11 @@ class ExcitationPlanner:
         else:
             self._intervals.pop()
         return self._search_end_message(
-            self._too_long_text if record_ticks >= self._max_ticks else "", is_reached=False
+            self._not_reached_text if record_ticks >= self._max_ticks else "", is_reached=False
         )
 
     @property
-    def _too_long_text(self) -> str:
+    def _not_reached_text(self) -> str:
         """Text that states that the precision was not reached in the maximum duration."""
         return f"Not reached within {self._max_ticks / self._rate_hz:g} s (--at-most)."
 
@@ -372,7 +372,7 @@ class ExcitationPlanner:
         remaining_s = remaining_ticks / self._rate_hz
         if remaining_s < SHORTEST_S + PAUSE_S:
             if self.may_be_last or remaining_ticks <= 0:
-                yield self._search_end_message(self._too_long_text, is_reached=False)
+                yield self._search_end_message(self._not_reached_text, is_reached=False)
             else:
                 self._append_pause(min(PAUSE_S, remaining_s))
             return
@@ -634,10 +634,10 @@ class _TimeForecast:
 
         It is None if there are too few estimates, or if the information hardly grows.
         """
-        required_s = self._required_s()
+        required_s = self._required_time_s()
         return None if required_s is None or required_s > _MAX_FORECAST_S else required_s
 
-    def _required_s(self) -> float | None:
+    def _required_time_s(self) -> float | None:
         """Return the time in s until the ratio is 1, however long; None if there is no forecast."""
         if len(self._information_at_times) < _MIN_FORECAST_ESTIMATES:
             return None
@@ -660,7 +660,7 @@ class _TimeForecast:
 
         The text is empty if the time may suffice.
         """
-        required_s = self._required_s()
+        required_s = self._required_time_s()
         if required_s is None or required_s <= _UNREACHABLE_TIME_RATIO * available_s:
             return ""
         now_s, present_information = self._information_at_times[-1]

@@ -44,7 +44,7 @@ class SeriesListener(Protocol):
     def on_message(self, level: Literal["info", "warning"], message_text: str) -> None:
         """Process a message for the operator before the first session."""
 
-    def on_live_view(self, view_text: str) -> None:
+    def on_live_view(self, live_view_text: str) -> None:
         """Process the text with the address of the live view, or on why there is no view."""
 
     def on_progress(self, progress: SessionProgress, events: list[LogEvent]) -> None:

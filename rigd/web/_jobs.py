@@ -39,7 +39,7 @@ class AnalysisJob:
     """Number of the job, from 1."""
     job_kind: str
     """Kind of the job: ``report``, ``campaign`` or ``export``."""
-    arguments: Sequence[str]
+    analyze_arguments: Sequence[str]
     """Arguments of `analyze`."""
     session_name: str = ""
     """Name of the job's session, or "" for several sessions."""
@@ -67,7 +67,7 @@ class AnalysisJob:
         }
 
 
-class Jobs:
+class JobQueue:
     """Runs queued jobs one after the other, without disturbing a session.
 
     Jobs work in the folder of the sessions and are `paused` while a session runs. `publish` is
@@ -145,7 +145,7 @@ class Jobs:
 
     async def _run_process(self, job: AnalysisJob) -> None:
         """Run a job's process to its end, or raise JobError if it is dropped or fails."""
-        child_process = ChildProcess(REPORT, *job.arguments, folder=self._folder)
+        child_process = ChildProcess(REPORT, *job.analyze_arguments, folder=self._folder)
         is_process_suspended = False
         try:
             while child_process.running:

@@ -17,7 +17,7 @@ from aiohttp import web
 from rigd.library import REPORT_PAGE, SessionRow, list_sessions
 from rigd.session.quick_look import QUICK_LOOK_SUFFIX, last_quick_look, read_quick_look
 from rigd.web._access import REPORT_POLICY, WebAccess, read_json_object, refusal_response
-from rigd.web._jobs import JobError, Jobs
+from rigd.web._jobs import JobError, JobQueue
 
 Document = dict[str, Any]
 
@@ -45,7 +45,7 @@ class Library:
     `access` permits reports, `jobs` is the queue for reports and exports.
     """
 
-    def __init__(self, folder: Path, access: WebAccess, jobs: Jobs) -> None:
+    def __init__(self, folder: Path, access: WebAccess, jobs: JobQueue) -> None:
         self._folder = folder
         self._access = access
         self._jobs = jobs

@@ -31,7 +31,7 @@ from rigd.web._access import (
     read_json_object,
     refusal_response,
 )
-from rigd.web._jobs import Jobs
+from rigd.web._jobs import JobQueue
 from rigd.web._library import Library
 from rigd.web._link import BusyError, DaemonError, DaemonLink
 from rigd.web._live import Pages
@@ -74,7 +74,7 @@ class OperatorPageServer:
         self._socket = Path(page_job["socket"])
         self._access = WebAccess(page_job["token"])
         self.pages = Pages()
-        self._jobs = Jobs(Path(page_job["folder"]), self.pages.send)
+        self._jobs = JobQueue(Path(page_job["folder"]), self.pages.send)
         self._library = Library(Path(page_job["folder"]), self._access, self._jobs)
         self._stopping = ThreadPoolExecutor(_MAX_SIMULTANEOUS_STOPS, "stop")
         self._link = DaemonLink(self._socket, self._process_message, self._report_loss)

@@ -207,7 +207,7 @@ def served(tmp_path_factory):
     server.close()
 
 
-JobError, Jobs, MAX_JOBS = _jobs.JobError, _jobs.Jobs, _jobs.MAX_WAITING_JOBS
+JobError, Jobs, MAX_JOBS = _jobs.JobError, _jobs.JobQueue, _jobs.MAX_WAITING_JOBS
 
 _PARTS = {
     "silent_s": (_access, "_FIRST_REQUEST_TIMEOUT_S"),

@@ -245,7 +245,7 @@ _jobs.REPORT = replace(_jobs.REPORT, module="stand_in")
 _jobs._POLL_PERIOD_S = 0.02
 
 async def work():
-    jobs = _jobs.Jobs(pathlib.Path(), lambda _: None)
+    jobs = _jobs.JobQueue(pathlib.Path(), lambda _: None)
     jobs.add_job("report", [sys.argv[1]])
     jobs.paused = False
     asyncio.create_task(jobs.run())
