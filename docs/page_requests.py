@@ -72,8 +72,8 @@ REQUESTS: dict[str, Document] = {
     },
     "GET /api/sessions": {
         "query": [
-            *(query(name, TEXT) for name in _library._FILTERS),
-            query("limit", whole_number(_library._DEFAULT_ROWS)),
+            *(query(name, TEXT) for name in _library._FILTER_NAMES),
+            query("limit", whole_number(_library._DEFAULT_ROW_LIMIT)),
             query("offset", whole_number(0)),
         ],
         "replies": {
@@ -110,7 +110,9 @@ REQUESTS: dict[str, Document] = {
     "GET /api/frf": {
         "query": [
             {
-                **query("ids", TEXT, f"1 to {_library._MAX_RESPONSES} names, comma-separated"),
+                **query(
+                    "ids", TEXT, f"1 to {_library._MAX_COMPARED_RESPONSES} names, comma-separated"
+                ),
                 "required": True,
             }
         ],
@@ -200,9 +202,9 @@ def operation(path: str, method: str, summary: str) -> Document:
 
 def command_schemas() -> Document:
     """Return the schemas of the commands that the page may send, as the socket checks them."""
-    schema = _protocol._REQUESTS.json_schema(ref_template=f"{SCHEMAS}{{model}}")
+    schema = _protocol._REQUEST_VALIDATOR.json_schema(ref_template=f"{SCHEMAS}{{model}}")
     mapping = schema["discriminator"]["mapping"]
-    permitted = {name: mapping[name] for name in sorted(_server._COMMANDS)}
+    permitted = {name: mapping[name] for name in sorted(_server._PAGE_COMMANDS)}
     left_out = {mapping[name].removeprefix(SCHEMAS) for name in mapping.keys() - permitted.keys()}
     return {
         "Command": {

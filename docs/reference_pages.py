@@ -39,7 +39,7 @@ def write_pages(folder: Path = GENERATED) -> None:
     pages = {
         "commands.txt": commands_text(),
         "profile_keys.txt": profile_text(),
-        "socket_requests.json": json_text(_protocol._REQUESTS.json_schema()),
+        "socket_requests.json": json_text(_protocol._REQUEST_VALIDATOR.json_schema()),
         "page_requests.json": json_text(page),
         "page_requests.txt": table(PAGE_COLUMNS, page_rows(page)),
         "python.txt": interfaces_text(list(interfaces)),

@@ -54,7 +54,7 @@ def test_target_precision_is_a_text():
 def test_predict_has_the_fields_of_a_start():
     request = parse(START | {"command": "predict", "parameters": {"stop_hz": 20}, "force": True})
     assert (request.parameters, request.force) == ({"stop_hz": 20.0}, True)
-    assert not request.controlling
+    assert not request.is_controlling
     with pytest.raises(RequestError, match="wobble"):
         parse(START | {"command": "predict", "parameters": {"wobble": 1}})
 
