@@ -72,8 +72,8 @@ class DefaultCommandGroup(TyperGroup):
     ) -> Any:  # noqa: ANN401
         """Parse the arguments of the command named first, or of the default command."""
         with readable_errors():
-            is_other = args and args[0] in self.commands and args[0] != DEFAULT_COMMAND
-            if is_other or args[:1] in _COMPLETION_OPTIONS:
+            is_other_command = args and args[0] in self.commands and args[0] != DEFAULT_COMMAND
+            if is_other_command or args[:1] in _COMPLETION_OPTIONS:
                 return super().make_context(info_name, args, parent, **extra)
             return self.commands[DEFAULT_COMMAND].make_context(info_name, args, parent, **extra)
 
@@ -94,7 +94,7 @@ class DefaultCommand(TyperCommand):
             with formatter.section("Structures of installed packages"):
                 formatter.write_dl(structures)
         with formatter.section("Commands"):
-            formatter.write_dl([*_OTHER_COMMANDS.items()])
+            formatter.write_dl([*_OTHER_COMMAND_DESCRIPTIONS.items()])
 
 
 def _names_of_added_structures() -> list[tuple[str, str]]:
@@ -123,12 +123,12 @@ Version = Annotated[
 """Option --version."""
 
 
-_EXIT_INTERRUPTED: Final = 130
+_INTERRUPTED_EXIT_CODE: Final = 130
 """Exit code after Ctrl-C."""
-_COLLECTION_THRESHOLD: Final = 20_000
+_GARBAGE_COLLECTION_THRESHOLD: Final = 20_000
 """Number of new objects that triggers a garbage collection."""
 
-_OTHER_COMMANDS: Final = {
+_OTHER_COMMAND_DESCRIPTIONS: Final = {
     "touch": "Estimate where, when and how hard the antenna met something.",
     "import": "Convert a record of another program to a session file (.csv, .mat, .tdms, .uff).",
     "export record": "Write the samples of a session for another program (.csv, .mat, .uff).",
@@ -152,10 +152,10 @@ Exit code: 0 done; 1 a file could not be analysed; 2 usage error; 130 stopped by
 _METHOD_NAMES: Final = ("welch", "record", "all")
 """Values of --method: analyses of a record."""
 
-_WELCH_OPTIONS: Final = ("types", "weights", "frf", "segment", "overlap", "nfft")
+_WELCH_OPTION_NAMES: Final = ("types", "weights", "frf", "segment", "overlap", "nfft")
 """Names of the options that only concern Welch fits."""
 
-_COMMAND_LINE_SOURCE: Final = "COMMANDLINE"
+_COMMAND_LINE_SOURCE_NAME: Final = "COMMANDLINE"
 """Name that click gives to the source of a value stated on the command line."""
 
 # Plain messages of one or two sentences, not boxes: they end up in logs.
@@ -176,13 +176,13 @@ def main() -> None:
     use_one_thread()
     # Figures consist of many objects that exist until they are drawn. A garbage collection after
     # every 700 new objects would take 5 % of the computing time.
-    gc.set_threshold(_COLLECTION_THRESHOLD)
+    gc.set_threshold(_GARBAGE_COLLECTION_THRESHOLD)
     _suppress_library_warnings()
     with standard_streams():
         try:
             app()
         except KeyboardInterrupt:
-            sys.exit(_EXIT_INTERRUPTED)
+            sys.exit(_INTERRUPTED_EXIT_CODE)
 
 
 def _suppress_library_warnings() -> None:
@@ -379,14 +379,14 @@ def analyze(
             param_hint="--uniformity",
         )
     if method == "record":
-        _check_record_method(context, is_campaign=is_campaign)
+        _check_record_method_options(context, is_campaign=is_campaign)
     if structure and (method == "welch" or is_campaign):
         raise typer.BadParameter(
             "it is for whole-record fits of single sessions; "
             f"{'add --each' if is_campaign else 'take --method all'}, or leave it out.",
             param_hint="--structure",
         )
-    _check_part(from_s, to_s, is_campaign=is_campaign)
+    _check_part_options(from_s, to_s, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     options = AnalysisOptions(
         settings,
@@ -404,7 +404,7 @@ def analyze(
         if json is not None and not output_options.json_to_stdout:
             check_new_file(json, "--json", overwrite=overwrite)
         if rerun is not None:
-            _check_rerun(rerun, files)
+            _check_rerun_option(rerun, files)
         if not is_campaign:
             exit_code = session_command(files, options, output_options, rerun)
         else:
@@ -437,7 +437,7 @@ def analyze(
         exit_code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
-        exit_code = _EXIT_INTERRUPTED
+        exit_code = _INTERRUPTED_EXIT_CODE
     raise typer.Exit(exit_code)
 
 
@@ -452,7 +452,7 @@ def _check_campaign_options(option_names: Sequence[str], files: Sequence[Path]) 
     raise typer.BadParameter(usage_reason, param_hint=" and ".join(option_names))
 
 
-def _check_part(from_s: float | None, to_s: float | None, *, is_campaign: bool) -> None:
+def _check_part_options(from_s: float | None, to_s: float | None, *, is_campaign: bool) -> None:
     """Raise a usage error if --from and --to select no part, or if they are given to a campaign."""
     option_values = {"--from": from_s, "--to": to_s}
     given_values = {name: value for name, value in option_values.items() if value is not None}
@@ -475,7 +475,7 @@ def _check_part(from_s: float | None, to_s: float | None, *, is_campaign: bool) 
         )
 
 
-def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
+def _check_record_method_options(context: typer.Context, *, is_campaign: bool) -> None:
     """Check the other options if --method selects only the whole-record fits.
 
     Raise a usage error for a campaign, which needs Welch fits. Otherwise print a warning if options
@@ -488,12 +488,13 @@ def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
             param_hint="--method",
         )
     option_sources = {
-        option_name: context.get_parameter_source(option_name) for option_name in _WELCH_OPTIONS
+        option_name: context.get_parameter_source(option_name)
+        for option_name in _WELCH_OPTION_NAMES
     }
     ineffective_options = [
         f"--{option_name}"
         for option_name, option_source in option_sources.items()
-        if option_source and option_source.name == _COMMAND_LINE_SOURCE
+        if option_source and option_source.name == _COMMAND_LINE_SOURCE_NAME
     ]
     if ineffective_options:
         typer.echo(
@@ -513,9 +514,14 @@ def _report_single_session(
     typer.echo(
         f"A campaign needs two sessions: {single_session_error.path} is reported alone.", err=True
     )
-    other_errors = {str(failure.path): failure.message for failure in single_session_error.failures}
+    messages_by_file = {
+        str(failure.path): failure.message for failure in single_session_error.failures
+    }
     return max(
-        1, session_command([single_session_error.path], options, outputs, other_errors=other_errors)
+        1,
+        session_command(
+            [single_session_error.path], options, outputs, other_errors=messages_by_file
+        ),
     )
 
 
@@ -580,7 +586,7 @@ def _figure_formats(option_text: str) -> tuple[FigureFormat, ...]:
     return tuple(figure_format for figure_format in FIGURE_FORMATS if figure_format in format_names)
 
 
-def _check_rerun(rerun_file: Path, files: Sequence[Path]) -> None:
+def _check_rerun_option(rerun_file: Path, files: Sequence[Path]) -> None:
     """Raise a usage error if --rerun is given with several sessions.
 
     Raise the error of `check_new_file` if the file of --rerun already exists.

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
     from analysis.results import FigureFormat
 
-_DEFAULT_NAME: Final = "campaign"
+_DEFAULT_CAMPAIGN_NAME: Final = "campaign"
 """Default name of a campaign, for its report folder."""
-_MAX_FIGURES: Final = 8
+_MAX_CAMPAIGN_FIGURES: Final = 8
 """Number of progress steps for drawing: the largest number of a campaign's figures."""
 
 
@@ -86,8 +86,12 @@ def campaign_command(
     from analysis.report.campaign_report import campaign_tables
     from analysis.report.folder import report_folders, write_new_file
 
-    folder_source = files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_NAME)
-    (report_folder,) = report_folders([folder_source], outputs.report, overwrite=outputs.overwrite)
+    report_folder_source = (
+        files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_CAMPAIGN_NAME)
+    )
+    (report_folder,) = report_folders(
+        [report_folder_source], outputs.report, overwrite=outputs.overwrite
+    )
     run_campaign = partial(
         campaign, files, settings, structures=structures, fixed_parameters=fixed, band_hz=band_hz,
         jobs=jobs, dask_address=dask, uniformity=uniformity,
@@ -128,11 +132,14 @@ def _analyse_and_write(
     from rigd.printable import progress_bar
 
     with progress_bar("{task.completed:.0f}/{task.total:.0f}") as progress:
-        bar = progress.add_task("starting", total=2 * file_count + _MAX_FIGURES)
+        progress_task = progress.add_task("starting", total=2 * file_count + _MAX_CAMPAIGN_FIGURES)
 
         def on_progress(done_steps: int, total_steps: int, file_name: str) -> None:
             progress.update(
-                bar, completed=done_steps, total=total_steps + _MAX_FIGURES, description=file_name
+                progress_task,
+                completed=done_steps,
+                total=total_steps + _MAX_CAMPAIGN_FIGURES,
+                description=file_name,
             )
 
         with new_report_folder(report_folder, overwrite=outputs.overwrite) as partial_folder:
@@ -141,13 +148,15 @@ def _analyse_and_write(
                 raise SingleSessionError(campaign_result.sessions[0].path, campaign_result.failures)
             write_campaign(
                 campaign_result, partial_folder, with_paper_values=with_paper, formats=formats,
-                on_step=lambda done_steps: progress.update(bar, advance=1, description=done_steps),
+                on_step=lambda step_text: progress.update(
+                    progress_task, advance=1, description=step_text
+                ),
             )  # fmt: skip
-    report_error = partial(print_readable, progress.console)
+    print_error_line = partial(print_readable, progress.console)
     for session_failure in campaign_result.failures:
-        report_error(f"Error: {session_failure.message}")
+        print_error_line(f"Error: {session_failure.message}")
     for lost_trial in campaign_result.failed_predictions:
-        report_error(
+        print_error_line(
             f"Error: {lost_trial.path} is not predicted from the others: {lost_trial.reason}"
         )
     return campaign_result

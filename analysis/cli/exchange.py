@@ -171,7 +171,7 @@ def import_command(
         raise typer.BadParameter(
             f"'{session}' does not end in .mcap, as a session file does.", param_hint="SESSION"
         )
-    options = {
+    channel_options = {
         "angle_rad": ("--angle", angle),
         "coupling_torque_nm": ("--torque", torque),
         "angle_reference_rad": ("--reference", reference),
@@ -184,14 +184,14 @@ def import_command(
         "tz_nm": ("--tz", tz),
     }
     channel_choices = {
-        field_name: _parse_channel(option, option_text, QUANTITIES[field_name])
-        for field_name, (option, option_text) in options.items()
+        field_name: _parse_channel(option_name, option_text, QUANTITIES[field_name])
+        for field_name, (option_name, option_text) in channel_options.items()
         if option_text is not None
     }
     time_choice = None if time is None else _parse_channel("--time", time, "time")
     segments_s = {
-        name: _parse_interval(option, option_text)
-        for name, option, option_text in (
+        name: _parse_interval(option_name, option_text)
+        for name, option_name, option_text in (
             ("rest", "--rest", rest),
             ("sweep", "--sweep", sweep),
             ("ring_down", "--ring-down", ring_down),
@@ -199,7 +199,7 @@ def import_command(
         if option_text is not None
     }
 
-    def run() -> None:
+    def import_session() -> None:
         import_plan = ImportPlan(
             channel_choices,
             read_specimen(profile),
@@ -227,7 +227,7 @@ def import_command(
             )
         )
 
-    raise typer.Exit(_exit_code(run))
+    raise typer.Exit(_run_for_exit_code(import_session))
 
 
 @export_app.command("record", epilog=_EXPORT_EPILOG)
@@ -238,11 +238,11 @@ def export_record_command(session: _Session, target: _Target, binary: _Binary = 
     """
     from analysis.exchange import export_record
 
-    def run() -> None:
+    def export_samples() -> None:
         export_table = export_record(session, target, binary=binary)
         typer.echo(f"{len(export_table.axis.values)} samples of {session}: {target}")
 
-    raise typer.Exit(_exit_code(run))
+    raise typer.Exit(_run_for_exit_code(export_samples))
 
 
 @export_app.command("frf", epilog=_EXPORT_EPILOG)
@@ -265,13 +265,13 @@ def export_frf_command(
     estimate_settings = welch_settings("I", "const", frf, segment, overlap, nfft)
     requested_band_hz = band_hz(band)
 
-    def run() -> None:
+    def export_response() -> None:
         export_table = export_frf(
             session, target, estimate_settings, requested_band_hz, binary=binary
         )
         typer.echo(f"{len(export_table.axis.values)} frequencies of {session}: {target}")
 
-    raise typer.Exit(_exit_code(run))
+    raise typer.Exit(_run_for_exit_code(export_response))
 
 
 @export_app.command("model", epilog=_MODEL_EPILOG)
@@ -332,7 +332,7 @@ def export_model_command(
         DEFAULT_SAMPLES if samples is None else samples,
     )
 
-    def run() -> None:
+    def export_linear_model() -> None:
         with progress_bar() as step_progress:
             progress_task = step_progress.add_task("", total=None)
             linear_model = export_model(
@@ -346,19 +346,19 @@ def export_model_command(
         for summary_line in _model_lines(linear_model, source, target):
             typer.echo(summary_line)
 
-    raise typer.Exit(_exit_code(run))
+    raise typer.Exit(_run_for_exit_code(export_linear_model))
 
 
 def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
     """Return the printed summary of an exported model, one statement per line."""
     state_space, accuracy = model.system, model.accuracy
-    test = model.identified.uniform_beam_test
-    uniformity_text = test.status
-    if test.p_value is not None:
-        uniformity_text += f", p = {test.p_value:.2g}"
+    uniform_beam_test = model.identified.uniform_beam_test
+    uniformity_text = uniform_beam_test.status
+    if uniform_beam_test.p_value is not None:
+        uniformity_text += f", p = {uniform_beam_test.p_value:.2g}"
     model_name = "exact beam" if model.kind == "beam" else "modal model"
     relaxation_count = sum(
-        model_name.startswith("relaxation") for model_name in state_space.states.names
+        state_name.startswith("relaxation") for state_name in state_space.states.names
     )
     time_text = "continuous time"
     if state_space.period_s:
@@ -398,10 +398,11 @@ def _parse_order(option_text: str) -> int | None:
     if not (
         option_text.isascii()
         and option_text.isdecimal()
-        and 1 <= int(option_text[:6]) <= _MAX_STATES
+        and 1 <= int(option_text[:6]) <= _MAX_ORDER_STATES
     ):
         raise typer.BadParameter(
-            f"'{option_text}' is neither auto nor a number of states from 1 to {_MAX_STATES}.",
+            f"'{option_text}' is neither auto nor a number of states from 1 to "
+            f"{_MAX_ORDER_STATES}.",
             param_hint="--order",
         )
     return int(option_text)
@@ -415,22 +416,22 @@ def _parse_rate(option_text: str) -> float | None:
         rate_hz = float(option_text)
     except ValueError:
         rate_hz = math.nan
-    if not _RATE_RANGE_HZ[0] <= rate_hz <= _RATE_RANGE_HZ[1]:
+    if not _SAMPLING_RATE_RANGE_HZ[0] <= rate_hz <= _SAMPLING_RATE_RANGE_HZ[1]:
         raise typer.BadParameter(
-            f"'{option_text}' is neither continuous nor a rate from {_RATE_RANGE_HZ[0]:g} to "
-            f"{_RATE_RANGE_HZ[1]:g} Hz.",
+            f"'{option_text}' is neither continuous nor a rate from "
+            f"{_SAMPLING_RATE_RANGE_HZ[0]:g} to {_SAMPLING_RATE_RANGE_HZ[1]:g} Hz.",
             param_hint="--rate",
         )
     return rate_hz
 
 
-_MAX_STATES: Final = 200
+_MAX_ORDER_STATES: Final = 200
 """Largest number of states that --order accepts."""
-_RATE_RANGE_HZ: Final = (1.0, 1e6)
+_SAMPLING_RATE_RANGE_HZ: Final = (1.0, 1e6)
 """Range of sampling rates in Hz that --rate accepts."""
 
 
-def _exit_code(run_command: Callable[[], None]) -> int:
+def _run_for_exit_code(run_command: Callable[[], None]) -> int:
     """Run the function of a command; print an error that it raises, and return the exit code."""
     from numpy.linalg import LinAlgError
 
@@ -463,35 +464,37 @@ def _exit_code(run_command: Callable[[], None]) -> int:
     return 0
 
 
-def _parse_channel(option: str, option_text: str, quantity: str) -> ChannelChoice:
+def _parse_channel(option_name: str, option_text: str, quantity: str) -> ChannelChoice:
     """Return the channel and unit in an option's text; raise a usage error if it is invalid."""
     from analysis.exchange import ExchangeError, parse_choice
 
     try:
         return parse_choice(option_text, quantity)
     except ExchangeError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error
+        raise typer.BadParameter(str(error), param_hint=option_name) from error
 
 
-_LATEST_END_S: Final = 1e6
+_MAX_SEGMENT_END_S: Final = 1e6
 """Latest end of a segment in seconds: longer than any record that can be imported."""
 
 
-def _parse_interval(option: str, option_text: str) -> tuple[float, float]:
+def _parse_interval(option_name: str, option_text: str) -> tuple[float, float]:
     """Return begin and end of a segment in seconds from an option's text; raise if invalid."""
     try:
         begin_s, end_s = (float(number_text) for number_text in option_text.split(","))
     except ValueError:
         begin_s = end_s = math.nan
-    if not 0.0 <= begin_s < end_s <= _LATEST_END_S:
+    if not 0.0 <= begin_s < end_s <= _MAX_SEGMENT_END_S:
         raise typer.BadParameter(
             f"'{option_text}' is not two times in s with 0 <= T0 < T1 <= 1e6, such as 1,121.",
-            param_hint=option,
+            param_hint=option_name,
         )
     return begin_s, end_s
 
 
-def _check_delay(option: str, delay_s: float) -> None:
+def _check_delay(option_name: str, delay_s: float) -> None:
     """Raise a usage error if a channel's delay exceeds one second."""
     if not abs(delay_s) <= 1.0:
-        raise typer.BadParameter(f"{delay_s} s cannot be the delay of a sample.", param_hint=option)
+        raise typer.BadParameter(
+            f"{delay_s} s cannot be the delay of a sample.", param_hint=option_name
+        )

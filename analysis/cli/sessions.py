@@ -86,13 +86,13 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
             session_file for session_file in path.glob("*.mcap") if session_file.is_file()
         )
         if not folder_sessions:
-            any_incomplete = any(path.glob("*.mcap.part"))
+            has_incomplete_session = any(path.glob("*.mcap.part"))
             raise NoSessionsError(
                 f"{path}: there is no session (*.mcap) in this folder; give session files, or the "
                 "folder that holds them."
                 + (
                     " Recover an incomplete file (*.mcap.part) with `rigd recover`."
-                    if any_incomplete
+                    if has_incomplete_session
                     else ""
                 )
             )
@@ -184,13 +184,13 @@ def session_command(
     if outputs.json_to_stdout:
         typer.echo(document_text(results_document, ascii_only=True), nl=False)
     elif outputs.json is not None:
-        _print_plain(console, f"All results as JSON: {outputs.json}")
+        _print_without_markup(console, f"All results as JSON: {outputs.json}")
     if rerun is not None:
-        _print_plain(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
+        _print_without_markup(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
     for session_file, folder in zip(files, folders, strict=True):
         if str(session_file) not in errors:
             report_page = folder / "report.html"
-            _print_plain(
+            _print_without_markup(
                 console,
                 f"Report of {session_file}: {report_page if report_page.exists() else folder}",
             )
@@ -255,7 +255,7 @@ def _analyse_all(
     with progress_bar() as file_progress:
         print_message = partial(print_readable, file_progress.console)
 
-        def warn_now(warning_text: str) -> None:
+        def print_warning(warning_text: str) -> None:
             print_message(f"Warning: {warning_text}")
 
         step_count = _count_steps(options, rerun_file)
@@ -264,10 +264,10 @@ def _analyse_all(
             zip(files, folders, strict=True), start=1
         ):
 
-            def on_step(done: str, name: str = session_file.name) -> None:
-                step_weight = _STEPS_PER_FIGURE if done.startswith("figure") else 1
+            def on_step(finished_step: str, file_name: str = session_file.name) -> None:
+                step_weight = _STEPS_PER_FIGURE if finished_step.startswith("figure") else 1
                 file_progress.update(
-                    progress_task, advance=step_weight, description=f"{name}: {done}"
+                    progress_task, advance=step_weight, description=f"{file_name}: {finished_step}"
                 )
 
             try:
@@ -278,7 +278,7 @@ def _analyse_all(
                         options,
                         rerun_file,
                         on_step,
-                        file_warnings[file_number - 1].append if len(files) > 1 else warn_now,
+                        file_warnings[file_number - 1].append if len(files) > 1 else print_warning,
                         overwrite=outputs.overwrite,
                     )
                 )
@@ -354,6 +354,6 @@ def _analyse_file(
     return file_result
 
 
-def _print_plain(console: Console, text: str) -> None:
+def _print_without_markup(console: Console, text: str) -> None:
     """Print a text without markup and line wrapping."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)

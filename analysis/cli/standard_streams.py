@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _STREAM_NAMES: Final = ("stdout", "stderr")
 """Attributes of `sys` with the standard streams."""
-_EXIT_FAILED: Final = 1
+_FAILURE_EXIT_CODE: Final = 1
 """Exit code if a standard stream cannot be written."""
 
 
@@ -81,15 +81,15 @@ def standard_streams() -> Iterator[None]:
         # Python would try to write the buffered text again, and print an error.
         for descriptor_number in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor_number)
-        sys.exit(_EXIT_FAILED)
+        sys.exit(_FAILURE_EXIT_CODE)
 
 
 def _pipe_tolerant_stream(stream: io.TextIOWrapper) -> io.TextIOWrapper:
     """Return a text stream to the same file descriptor that ignores a closed pipe."""
     stream.flush()
-    raw: io.RawIOBase = _PipeTolerantDescriptor(stream.fileno(), "wb", closefd=False)
+    raw_stream: io.RawIOBase = _PipeTolerantDescriptor(stream.fileno(), "wb", closefd=False)
     return io.TextIOWrapper(
-        io.BufferedWriter(raw),
+        io.BufferedWriter(raw_stream),
         encoding=stream.encoding,
         errors=stream.errors,
         # Standard error has no buffer of its own and is written at once.

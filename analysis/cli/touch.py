@@ -100,17 +100,17 @@ def _run_analysis(files: Sequence[Path], model_file: Path | None, outputs: Outpu
         with new_report_folder(outputs.report) as partial_folder:
             write_touch_report(session_touches, error_messages, partial_folder)
     console = outputs.console()
-    print_plain = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    print_without_markup = partial(console.print, markup=False, highlight=False, soft_wrap=True)
     for touched_session in session_touches:
         for table_line in session_lines(touched_session):
-            print_plain(table_line)
+            print_without_markup(table_line)
     if any(touched_session.touches for touched_session in session_touches):
-        print_plain("")
+        print_without_markup("")
         console.print(terminal_table(touches_table(session_touches)))
     if outputs.json_to_stdout:
         typer.echo(document_text(json_document, ascii_only=True), nl=False)
     if outputs.report is not None and session_touches:
-        print_plain(f"Report: {outputs.report / 'report.html'}")
+        print_without_markup(f"Report: {outputs.report / 'report.html'}")
     return 1 if error_messages else 0
 
 
@@ -130,8 +130,8 @@ def _analyse_sessions(
         progress_task = file_progress.add_task("", total=len(files))
         for file_number, session_file in enumerate(files):
 
-            def on_step(step: str, name: str = session_file.name) -> None:
-                file_progress.update(progress_task, description=f"{name}: {step}")
+            def on_step(step: str, file_name: str = session_file.name) -> None:
+                file_progress.update(progress_task, description=f"{file_name}: {step}")
 
             try:
                 session_touches.append(touch_analysis.analyse_session(session_file, on_step))

@@ -112,15 +112,15 @@ def band_hz(option_text: str | None) -> tuple[float, float] | None:
     if option_text is None:
         return None
     try:
-        first_hz, last_hz = (float(frequency_text) for frequency_text in option_text.split(","))
+        low_hz, high_hz = (float(frequency_text) for frequency_text in option_text.split(","))
     except ValueError:
-        first_hz = last_hz = math.nan
-    if not 0.0 <= first_hz < last_hz < math.inf:
+        low_hz = high_hz = math.nan
+    if not 0.0 <= low_hz < high_hz < math.inf:
         raise typer.BadParameter(
             f"'{option_text}' is not two frequencies in Hz with 0 <= F0 < F1, such as 0.5875,50.",
             param_hint="--band",
         )
-    return first_hz, last_hz
+    return low_hz, high_hz
 
 
 def _parse_types(option_text: str) -> tuple[str, ...]:

@@ -53,7 +53,7 @@ UNIT_SIZES: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
 )
 """Size of each unit in rad, N·m, N or s, by the quantity it measures."""
 
-_NAME_SUFFIXES: Final = {
+_UNITS_BY_NAME_SUFFIX: Final = {
     "rad": "rad",
     "mrad": "mrad",
     "deg": "deg",
@@ -66,7 +66,7 @@ _NAME_SUFFIXES: Final = {
 }
 """Unit that the last word of a channel's name suggests."""
 
-_NUMBER_PATTERN: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=\s*[^\s\d.])")
+_LEADING_NUMBER_PATTERN: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=\s*[^\s\d.])")
 """Pattern of a number that is followed by a unit."""
 _BRACKETS_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
 """Pattern of a text in brackets at the end of a name."""
@@ -91,7 +91,7 @@ def unit_factor(quantity: str, unit: str) -> float:
     of a sensor's signal. Raise `ExchangeError` if it is no unit of that quantity, or if the number
     is not finite or is 0.
     """
-    unit_count, unit_name = _split_number(unit)
+    unit_count, unit_name = _split_unit_number(unit)
     canonical_name = canonical_unit(unit_name)
     if (
         canonical_name is None
@@ -108,10 +108,10 @@ def unit_factor(quantity: str, unit: str) -> float:
     return unit_count * UNIT_SIZES[quantity][canonical_name]
 
 
-def stated_unit(unit: str) -> str:
+def canonical_unit_text(unit: str) -> str:
     """Return a unit as spelled in `UNIT_SIZES`, preceded by its number if this is not 1."""
-    unit_count, stated_name = _split_number(unit)
-    unit_name = canonical_unit(stated_name) or stated_name
+    unit_count, unit_spelling = _split_unit_number(unit)
+    unit_name = canonical_unit(unit_spelling) or unit_spelling
     return unit_name if unit_count == 1.0 else f"{unit_count!r} {unit_name}"
 
 
@@ -124,12 +124,12 @@ def unit_in_brackets(channel_name: str) -> str | None:
 def unit_in_suffix(channel_name: str) -> str | None:
     """Return the unit that the last word of a name suggests, as in ``angle_rad``, or None."""
     _, underscore, last_word = channel_name.strip().rpartition("_")
-    return _NAME_SUFFIXES.get(last_word) if underscore else None
+    return _UNITS_BY_NAME_SUFFIX.get(last_word) if underscore else None
 
 
-def _split_number(unit: str) -> tuple[float, str]:
+def _split_unit_number(unit: str) -> tuple[float, str]:
     """Split a text such as ``0.02 N.m`` into number and unit; the number is 1 by default."""
-    number_match = _NUMBER_PATTERN.match(unit.strip())
+    number_match = _LEADING_NUMBER_PATTERN.match(unit.strip())
     return (
         (float(number_match[0]), unit.strip()[number_match.end() :])
         if number_match
@@ -243,12 +243,12 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
             f"{', '.join(UNIT_SIZES[quantity])}. A unit is never guessed."
         )
     unit_size = unit_factor(quantity, unit)
-    return ChannelChoice(channel.strip(), stated_unit(unit), unit_size)
+    return ChannelChoice(channel.strip(), canonical_unit_text(unit), unit_size)
 
 
 # Time base
 
-MAX_JITTER: Final = 0.1
+MAX_JITTER_PERIODS: Final = 0.1
 """Largest permitted distance of a time stamp from its tick, in sample periods. Beyond it, the tick
 of the sample is doubtful."""
 
@@ -260,10 +260,10 @@ MAX_GAP_FRACTION: Final = 0.05
 """Largest permitted fraction of the steps between samples that are longer than one tick. With more,
 the times are too coarse to determine the rate, as whole milliseconds are at 700 Hz."""
 
-RATE_RANGE_HZ: Final = (0.1, 1e6)
+SESSION_RATE_RANGE_HZ: Final = (0.1, 1e6)
 """Lowest and highest sampling rate of a session."""
 
-_RATE_DIGITS: Final = 9
+_RATE_SIGNIFICANT_DIGITS: Final = 9
 """Number of digits to which a rate from time stamps is rounded: 1000.0000000002 becomes 1000."""
 
 
@@ -286,15 +286,15 @@ class Timebase:
     jitter: float
 
     @property
-    def missing(self) -> int:
+    def missing_ticks(self) -> int:
         """Number of ticks between the first and the last that have no sample."""
         return int(self.ticks[-1]) + 1 - len(self.ticks)
 
 
-def uniform_timebase(path: Path, samples: int, rate_hz: float) -> Timebase:
+def uniform_timebase(path: Path, sample_count: int, rate_hz: float) -> Timebase:
     """Return the time base of samples without gaps, at the rate that the user states."""
     _check_rate(path, rate_hz)
-    return Timebase(np.arange(samples), rate_hz, 0.0)
+    return Timebase(np.arange(sample_count), rate_hz, 0.0)
 
 
 def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) -> Timebase:
@@ -324,8 +324,8 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
         )
     # The median distinguishes a step of one tick from a gap. The mean over all steps of one tick,
     # unlike the median, does not depend on the number of digits of the times.
-    is_one_tick = steps_s < 1.5 * np.median(steps_s)
-    tick_steps = np.round(steps_s / steps_s[is_one_tick].mean())
+    is_one_tick_step = steps_s < 1.5 * np.median(steps_s)
+    tick_steps = np.round(steps_s / steps_s[is_one_tick_step].mean())
     gap_fraction = np.count_nonzero(tick_steps > 1) / len(tick_steps)
     if gap_fraction > MAX_GAP_FRACTION:
         raise ExchangeError(
@@ -342,12 +342,12 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
             "periods, so most of the record is missing; cut the session out of the file."
         )
     period_s = _regression_slope(ticks, time_s)
-    rate_hz = float(f"{1 / period_s:.{_RATE_DIGITS}g}")
+    rate_hz = float(f"{1 / period_s:.{_RATE_SIGNIFICANT_DIGITS}g}")
     _check_rate(path, rate_hz)
     tick_deviation = (time_s - time_s[0]) * rate_hz - ticks
     tick_deviation = np.abs(tick_deviation - np.median(tick_deviation))
     worst_index = int(np.argmax(tick_deviation))
-    if tick_deviation[worst_index] > MAX_JITTER:
+    if tick_deviation[worst_index] > MAX_JITTER_PERIODS:
         raise ExchangeError(
             f"{path}: the times '{channel}' are not equidistant: sample {worst_index + 1} lies "
             f"{tick_deviation[worst_index]:.2g} periods from its position at {rate_hz:g} Hz. "
@@ -365,7 +365,7 @@ def _regression_slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
 
 def _check_rate(path: Path, rate_hz: float) -> None:
     """Raise if a sampling rate is outside the range of sessions."""
-    lowest_hz, highest_hz = RATE_RANGE_HZ
+    lowest_hz, highest_hz = SESSION_RATE_RANGE_HZ
     if not lowest_hz <= rate_hz <= highest_hz:
         raise ExchangeError(
             f"{path}: a rate of {rate_hz:g} Hz is outside the range of sessions, {lowest_hz:g} to "

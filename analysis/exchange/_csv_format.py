@@ -11,7 +11,7 @@ from analysis.exchange._source import (
     ExchangeError,
     FileTimes,
     SourceChannel,
-    check_samples,
+    check_sample_count,
 )
 from rigd.session.limits import MAX_SAMPLES
 from rigd.text_table import TableError, read_table
@@ -51,7 +51,7 @@ def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel
         )
         for channel_name, column in table.columns.items()
     }
-    check_samples(path, "The file", len(next(iter(channels.values())).values))
+    check_sample_count(path, "The file", len(next(iter(channels.values())).values))
     return channels
 
 

@@ -138,13 +138,13 @@ def export_model(
     check_new_file(target, "The file")
     is_session_file = source.suffix.lower() == ".mcap"
     on_step("analysis" if is_session_file else "document")
-    identified_models = (
+    identified_model = (
         identify_session(source) if is_session_file else read_identified_model(source)
     )
-    model = linear_model(identified_models, options, on_step)
+    model = linear_model(identified_model, options, on_step)
     on_step("file")
     variables = {**model.variables(), "exported_by": f"rigd {rigd.__version__}"}
-    with _new_file(target) as stream:
+    with _open_new_file(target) as stream:
         MODEL_FORMATS[target.suffix.lower()](variables, stream)
     return model
 
@@ -175,7 +175,7 @@ def _check_suffix(target: Path, suffixes: Collection[str]) -> None:
 
 def _write_table(table: ExportTable, target: Path, *, binary: bool) -> None:
     """Write a table to a new file in the format of its suffix."""
-    with _new_file(target) as stream:
+    with _open_new_file(target) as stream:
         match target.suffix.lower():
             case ".csv":
                 from analysis.exchange._csv_format import write_csv
@@ -192,7 +192,7 @@ def _write_table(table: ExportTable, target: Path, *, binary: bool) -> None:
 
 
 @contextmanager
-def _new_file(path: Path) -> Iterator[BinaryIO]:
+def _open_new_file(path: Path) -> Iterator[BinaryIO]:
     """Open a new file for writing; the file is removed if writing fails."""
     try:
         stream = path.open("xb")

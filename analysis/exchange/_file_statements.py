@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.exchange._channels import (
-    MAX_JITTER,
+    MAX_JITTER_PERIODS,
     canonical_unit,
     timebase_from_stamps,
     uniform_timebase,
@@ -38,22 +38,22 @@ _RATE_TOLERANCE: Final = 2e-5
 """Largest relative difference between the file's rate and the user's that is no contradiction;
 UFF58 files state six digits."""
 
-_COARSE_TOLERANCE: Final = 1e-3
+_COARSE_RATE_TOLERANCE: Final = 1e-3
 """Largest relative difference that is no contradiction between the user's rate and that of times
 with too few digits for a time base."""
 
-_DEFAULT_RATE_HZ: Final = 1.0
+_UNSET_RATE_HZ: Final = 1.0
 """Sampling rate that LabVIEW and other programs write if the user has given them none."""
 
 _TIME_UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
 """Units in seconds that times without a stated unit may have."""
-_UNIT_RATIOS: Final = (1e3, 1e6, 1e9)
+_WRONG_UNIT_RATE_RATIOS: Final = (1e3, 1e6, 1e9)
 """Ratios between two rates that indicate a wrong unit of time."""
 
 _NO_UNIT_TEXTS: Final = ("", "NONE", "none", "-")
 """Texts by which files state that a channel has no unit."""
 
-_REPORTED_SHIFT: Final = 0.01
+_MIN_REPORTED_SHIFT_PERIODS: Final = 0.01
 """Smallest time shift between channels that is reported, in sample periods."""
 
 
@@ -62,12 +62,12 @@ def plan_timebase(path: Path, plan: ImportPlan, channels: Mapping[str, SourceCha
     if plan.time is not None:
         time_s = channels[plan.time.channel].values * plan.time.factor
         return timebase_from_stamps(path, plan.time.channel, time_s)
-    samples = len(next(iter(channels.values())).values)
-    return uniform_timebase(path, samples, plan.rate_hz or 0.0)
+    sample_count = len(next(iter(channels.values())).values)
+    return uniform_timebase(path, sample_count, plan.rate_hz or 0.0)
 
 
 @dataclass(slots=True)
-class FileStatements:
+class FileMetadataCheck:
     """Comparison of the statements of a file with an import plan.
 
     Attributes
@@ -103,7 +103,7 @@ class FileStatements:
         Raise `ExchangeError` if the file states another unit than the user, and the plan does not
         override it.
         """
-        for choice in self.plan.choices:
+        for choice in self.plan.channel_choices:
             unit_label = channels[choice.channel].unit_label.strip()
             stated_unit = (
                 canonical_unit(unit_label) if unit_label else unit_in_brackets(choice.channel)
@@ -163,15 +163,16 @@ class FileStatements:
         """Report that the file states another rate than the one used, as a warning or an error."""
         time_choice = self.plan.time
         statement = f"the file says that '{source_name}' was sampled at {file_rate_hz:.6g} Hz"
-        is_default = file_rate_hz == _DEFAULT_RATE_HZ
+        is_unset_rate = file_rate_hz == _UNSET_RATE_HZ
         rate_ratio = max(file_rate_hz / rate_hz, rate_hz / file_rate_hz)
         is_wrong_unit = any(
-            abs(rate_ratio / unit_ratio - 1) < _RATE_TOLERANCE for unit_ratio in _UNIT_RATIOS
+            abs(rate_ratio / unit_ratio - 1) < _RATE_TOLERANCE
+            for unit_ratio in _WRONG_UNIT_RATE_RATIOS
         )
-        if is_default:
+        if is_unset_rate:
             statement += ", which programs write where no rate was given"
         if time_choice is not None and (
-            time_choice.channel == source_name or is_default or not is_wrong_unit
+            time_choice.channel == source_name or is_unset_rate or not is_wrong_unit
         ):
             self.warnings.append(
                 f"T{statement[1:]}; {rate_hz:.6g} Hz was used, as the times in "
@@ -187,7 +188,7 @@ class FileStatements:
             self.report_contradiction(
                 f"{statement}, and {rate_hz:.6g} Hz was stated",
                 "give the channel of times with --time"
-                if is_default
+                if is_unset_rate
                 else f"state --rate-hz {file_rate_hz:.6g}, or give the channel of times with "
                 "--time",
             )
@@ -223,7 +224,7 @@ class FileStatements:
             float(np.median(time_steps[time_steps > 0.0])) if (time_steps > 0.0).any() else 0.0
         )
         if (time_steps == 0.0).any() and any(
-            abs(rate_hz * typical_step * unit_s - 1) < _COARSE_TOLERANCE for unit_s in units_s
+            abs(rate_hz * typical_step * unit_s - 1) < _COARSE_RATE_TOLERANCE for unit_s in units_s
         ):
             self.report_contradiction(
                 f"the time {times_name} of sample {int(np.argmax(time_steps == 0.0)) + 2} is that "
@@ -234,8 +235,8 @@ class FileStatements:
         mean_step = float(finite_times[-1] - finite_times[0]) / (len(finite_times) - 1)
         if mean_step == 0.0 or (file_times.name == "#1" and mean_step == 1.0):
             return  # the values are constant or sample numbers
-        best_unit_s = min(units_s, key=lambda unit: abs(np.log(rate_hz * mean_step * unit)))
-        rate_tolerance = _COARSE_TOLERANCE + 2 * typical_step / float(
+        best_unit_s = min(units_s, key=lambda unit_s: abs(np.log(rate_hz * mean_step * unit_s)))
+        rate_tolerance = _COARSE_RATE_TOLERANCE + 2 * typical_step / float(
             finite_times[-1] - finite_times[0]
         )
         missing_ticks = 0
@@ -247,7 +248,7 @@ class FileStatements:
         except ExchangeError:
             pass
         else:
-            file_rate_hz, missing_ticks = file_timebase.rate_hz, file_timebase.missing
+            file_rate_hz, missing_ticks = file_timebase.rate_hz, file_timebase.missing_ticks
             rate_tolerance = _RATE_TOLERANCE + 2 * file_timebase.jitter / len(finite_times)
         if missing_ticks:
             self.report_contradiction(
@@ -262,7 +263,7 @@ class FileStatements:
                 f"give --time '{file_times.name}:UNIT' instead of --rate-hz",
             )
 
-    def align(
+    def align_channels(
         self, channels: Mapping[str, SourceChannel], timebase: Timebase
     ) -> tuple[Mapping[str, SourceChannel], Mapping[str, float]]:
         """Cut channels that begin at different times to their common interval.
@@ -278,7 +279,7 @@ class FileStatements:
         if len(set(starts_ns.values())) < 2:
             unknown_starts = sorted(measured_channels - set(starts_ns))
             start_ns = next(iter(starts_ns.values()), 0)
-            if unknown_starts and start_ns and abs(start_ns) < _EARLIEST_DATE_NS:
+            if unknown_starts and start_ns and abs(start_ns) < _MIN_DATE_NS:
                 self.report_contradiction(
                     f"the file says that '{next(iter(starts_ns))}' begins at "
                     f"{_time_text(start_ns)}, and does not say when '{unknown_starts[0]}' begins",
@@ -304,24 +305,27 @@ class FileStatements:
             self.report_contradiction(statement, "")
             check_lengths(self.path, channels)
             return channels, {}
-        remedy = "give channels that begin together, or cut them to the same samples"
-        without_start = sorted(set(channels) - set(starts_ns))
-        if without_start:
+        alignment_remedy = "give channels that begin together, or cut them to the same samples"
+        channels_without_start = sorted(set(channels) - set(starts_ns))
+        if channels_without_start:
             self.report_contradiction(
-                f"{statement}, and does not say when '{without_start[0]}' begins", remedy
+                f"{statement}, and does not say when '{channels_without_start[0]}' begins",
+                alignment_remedy,
             )
-        if timebase.missing:
-            self.report_contradiction(f"{statement}, and the times have gaps", remedy)
+        if timebase.missing_ticks:
+            self.report_contradiction(f"{statement}, and the times have gaps", alignment_remedy)
         period_ns = 1e9 / timebase.rate_hz
         skipped_samples = {
             n: round((starts_ns[last_channel] - channel_start_ns) / period_ns)
             for n, channel_start_ns in starts_ns.items()
         }
-        common_length = min(
+        common_sample_count = min(
             len(channel.values) - skipped_samples[n] for n, channel in channels.items()
         )
-        if common_length < 2:
-            self.report_contradiction(f"{statement}, so that they have no time in common", remedy)
+        if common_sample_count < 2:
+            self.report_contradiction(
+                f"{statement}, so that they have no time in common", alignment_remedy
+            )
         angle_channel = plan.channels["angle_rad"].channel
         delays_s = {
             n: (
@@ -336,7 +340,9 @@ class FileStatements:
         aligned_channels = {
             n: replace(
                 channel,
-                values=channel.values[skipped_samples[n] : skipped_samples[n] + common_length],
+                values=channel.values[
+                    skipped_samples[n] : skipped_samples[n] + common_sample_count
+                ],
             )
             for n, channel in channels.items()
         }
@@ -358,13 +364,16 @@ class FileStatements:
             self.plan.channels[name].channel for name in ("angle_rad", "coupling_torque_nm")
         }
         for name, delay_s in delays_s.items():
-            shift = abs(delay_s) * rate_hz
-            is_time = self.plan.time is not None and name == self.plan.time.channel
-            if shift > MAX_JITTER and name not in channels_with_delay and not is_time:
+            shift_periods = abs(delay_s) * rate_hz
+            is_time_channel = self.plan.time is not None and name == self.plan.time.channel
+            if (
+                shift_periods > MAX_JITTER_PERIODS
+                and name not in channels_with_delay
+                and not is_time_channel
+            ):
                 self.report_contradiction(
-                    f"{statement}, and '{name}' lies {shift:.2g} periods between the samples "
-                    "of the "
-                    "angle",
+                    f"{statement}, and '{name}' lies {shift_periods:.2g} periods between the "
+                    "samples of the angle",
                     "leave this channel out: no analysis needs it",
                 )
         skips_text = ", ".join(
@@ -375,7 +384,7 @@ class FileStatements:
         delays_text = ", ".join(
             f"{delay_s:.6g} s of '{name}'"
             for name, delay_s in delays_s.items()
-            if abs(delay_s) * rate_hz > _REPORTED_SHIFT and name in channels_with_delay
+            if abs(delay_s) * rate_hz > _MIN_REPORTED_SHIFT_PERIODS and name in channels_with_delay
         )
         self.warnings.append(
             f"T{statement[1:]}."
@@ -384,7 +393,7 @@ class FileStatements:
         )
 
 
-_EARLIEST_DATE_NS: Final = 10**17
+_MIN_DATE_NS: Final = 10**17
 """Smallest time in ns that is a date (from 1973 on); smaller ones are relative to the record."""
 
 
@@ -393,6 +402,6 @@ def _time_text(time_ns: int) -> str:
 
     Times below `_EARLIEST_DATE_NS` are offsets, which do not count from 1970.
     """
-    if abs(time_ns) < _EARLIEST_DATE_NS:
+    if abs(time_ns) < _MIN_DATE_NS:
         return f"{time_ns / 1e9:.9g} s"
     return str(np.datetime64(time_ns, "ns")).rstrip("0").rstrip(".")

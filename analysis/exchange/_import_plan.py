@@ -38,7 +38,7 @@ class ImportPlan:
     reverse_torque : bool
         Whether the sign of the coupling torque is reversed, because the sensor measures the
         reaction.
-    note, label, operator : str
+    note, specimen_label, operator : str
         Note, label of the specimen, and name of the operator.
     ignore_file_metadata : bool
         Whether the plan overrides the file's rate, times, start, units and scale.
@@ -53,7 +53,7 @@ class ImportPlan:
     torque_delay_s: float = 0.0
     reverse_torque: bool = False
     note: str = ""
-    label: str = ""
+    specimen_label: str = ""
     operator: str = ""
     ignore_file_metadata: bool = False
 
@@ -64,6 +64,6 @@ class ImportPlan:
             raise ValueError("a plan needs either a channel of times or a rate")
 
     @property
-    def choices(self) -> tuple[ChannelChoice, ...]:
+    def channel_choices(self) -> tuple[ChannelChoice, ...]:
         """Choices of all channels that are to be read."""
         return (*self.channels.values(), *(() if self.time is None else (self.time,)))

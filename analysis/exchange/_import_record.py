@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 import rigd
-from analysis.exchange._file_statements import FileStatements, plan_timebase
+from analysis.exchange._file_statements import FileMetadataCheck, plan_timebase
 from analysis.exchange._import_plan import REQUIRED_FIELDS, ImportPlan
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, unknown_fraction_message
@@ -86,18 +86,18 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     rigd.session.SessionError
         If the session exists or cannot be written.
     """
-    channel_names = list(dict.fromkeys(choice.channel for choice in plan.choices))
+    channel_names = list(dict.fromkeys(choice.channel for choice in plan.channel_choices))
     file_format, channels = read_source(source, channel_names)
     channel_remarks = dict.fromkeys(
         channel.remark for channel in channels.values() if channel.remark
     )
-    statements = FileStatements(source, plan, [*channel_remarks])
-    statements.check_scales(channels)
-    statements.check_units(channels)
-    timebase = statements.timebase(channels)
-    channels, delays_s = statements.align(channels, timebase)
+    metadata_check = FileMetadataCheck(source, plan, [*channel_remarks])
+    metadata_check.check_scales(channels)
+    metadata_check.check_units(channels)
+    timebase = metadata_check.timebase(channels)
+    channels, delays_s = metadata_check.align_channels(channels, timebase)
     timebase = plan_timebase(source, plan, channels)
-    warnings = statements.warnings
+    warnings = metadata_check.warnings
     warnings += _check_duration(source, plan, timebase)
     segments = _segment_ticks(
         source, plan.segments_s, timebase.rate_hz, int(timebase.ticks[-1]) + 1
@@ -130,8 +130,8 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     ):
         delay_s = delays_s.get(plan.channels[field_name].channel, 0.0)
         metadata[key] = repr(float(metadata[key]) + delay_s)
-    if statements.ignored:
-        metadata["import_ignored"] = "; ".join(statements.ignored)
+    if metadata_check.ignored:
+        metadata["import_ignored"] = "; ".join(metadata_check.ignored)
     write_session(
         target,
         {**si_columns, "tick": ticks, "status": status_bits},
@@ -144,14 +144,14 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     return ImportedRecord(target, len(ticks), timebase.rate_hz, segments, tuple(warnings))
 
 
-_LATEST_START_NS: Final = 2**63 - 1
+_MAX_START_UTC_NS: Final = 2**63 - 1
 """Latest time that a session file can state, in nanoseconds since 1970 (the year 2262)."""
 
 
 def _session_start(source: Path, duration_s: float) -> tuple[int, str]:
     """Return the file's modification time in ns, or the present time with a warning."""
     modification_ns = source.stat().st_mtime_ns
-    if modification_ns >= 0 and modification_ns + duration_s * 1e9 < _LATEST_START_NS:
+    if modification_ns >= 0 and modification_ns + duration_s * 1e9 < _MAX_START_UTC_NS:
         return modification_ns, ""
     modification_year = 1970 + modification_ns / (365.2425 * 86_400e9)
     return time.time_ns(), (
@@ -201,19 +201,19 @@ def _si_columns(
 
 
 def _segment_ticks(
-    path: Path, segments_s: Mapping[str, tuple[float, float]], rate_hz: float, ticks: int
+    path: Path, segments_s: Mapping[str, tuple[float, float]], rate_hz: float, tick_count: int
 ) -> dict[str, tuple[int, int]]:
     """Return first and end tick of each segment; raise if a segment is not inside the record."""
-    ticks_by_name = {}
+    segment_ticks = {}
     for segment_name, (start_s, end_s) in segments_s.items():
         first_tick, end_tick = round(start_s * rate_hz), round(end_s * rate_hz)
-        if not 0 <= first_tick < end_tick <= ticks:
+        if not 0 <= first_tick < end_tick <= tick_count:
             raise ExchangeError(
                 f"{path}: the segment {segment_name} from {start_s:g} to {end_s:g} s is not inside "
-                f"the record, which lasts {ticks / rate_hz:g} s; count from the first sample."
+                f"the record, which lasts {tick_count / rate_hz:g} s; count from the first sample."
             )
-        ticks_by_name[segment_name] = (first_tick, end_tick)
-    return ticks_by_name
+        segment_ticks[segment_name] = (first_tick, end_tick)
+    return segment_ticks
 
 
 def _describe_missing_samples(
@@ -291,7 +291,7 @@ def _session_metadata(
             key: stated_text
             for key, stated_text in (
                 ("operator", plan.operator),
-                ("specimen", plan.label),
+                ("specimen", plan.specimen_label),
                 ("note", plan.note),
             )
             if stated_text
@@ -366,13 +366,13 @@ def _hold_last(samples: NDArray[np.float64], is_bad: NDArray[np.bool_]) -> NDArr
 
 # Plausibility of the torque
 
-_CHECK_BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
+_TORQUE_CHECK_BAND_RATIOS: Final = ((0.25, 0.6), (1.5, 3.5))
 """Frequency bands of the torque check, as multiples of the first natural frequency. They are on
 both sides of the first resonance, far enough from it and from the first antiresonance (at 4.4) for
 damping not to matter, and above the frequencies at which the paper's external damping torque
 exceeds the inertial torque."""
 
-_SIGNIFICANT_STDS: Final = 6.0
+_MIN_SIGNIFICANT_RATIO_STDS: Final = 6.0
 """Smallest ratio of measured to modelled torque that is significant, in standard deviations of the
 ratio. It is not significant if the motion does not excite the bands."""
 
@@ -380,7 +380,7 @@ _TAPER_FRACTION: Final = 0.05
 """Fraction of the record that is tapered at each end, as a record may begin and end in motion. It
 is short, because the paper's chirp passes the bands early."""
 
-_LARGEST_RATIO: Final = 3.0
+_MAX_PLAUSIBLE_TORQUE_RATIO: Final = 3.0
 """Largest ratio of measured to modelled torque that damping and a wrong mass may explain. Units
 that are easily confused differ by a factor of more than ten."""
 
@@ -397,10 +397,12 @@ def torque_anomaly(
     anomaly and remedy, or None if the torque is plausible or the motion too small for the check.
     """
     frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
-    first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
+    first_mode_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
     in_band = np.zeros(frequency_hz.shape, dtype=np.bool_)
-    for low_ratio, high_ratio in _CHECK_BANDS:
-        in_band |= (frequency_hz >= low_ratio * first_hz) & (frequency_hz <= high_ratio * first_hz)
+    for low_ratio, high_ratio in _TORQUE_CHECK_BAND_RATIOS:
+        in_band |= (frequency_hz >= low_ratio * first_mode_hz) & (
+            frequency_hz <= high_ratio * first_mode_hz
+        )
     s = 2j * np.pi * frequency_hz[in_band]
     centre_distance = np.abs(
         np.linspace(-1.0, 1.0, len(angle_rad))
@@ -423,10 +425,10 @@ def torque_anomaly(
         torque_ratio = complex(np.vdot(model_spectrum, torque_spectrum) / model_power)
     ratio_magnitude = abs(torque_ratio)
     explained_power = ratio_magnitude**2 * model_power
-    noise_per_bin = max(torque_power - explained_power, 0.0) / np.count_nonzero(in_band)
-    if explained_power < _SIGNIFICANT_STDS**2 * noise_per_bin:
+    noise_power_per_bin = max(torque_power - explained_power, 0.0) / np.count_nonzero(in_band)
+    if explained_power < _MIN_SIGNIFICANT_RATIO_STDS**2 * noise_power_per_bin:
         return None
-    if not 1 / _LARGEST_RATIO < ratio_magnitude < _LARGEST_RATIO:
+    if not 1 / _MAX_PLAUSIBLE_TORQUE_RATIO < ratio_magnitude < _MAX_PLAUSIBLE_TORQUE_RATIO:
         return (
             f"The torque is {ratio_magnitude:.3g} times that of this beam: check the units of "
             "angle and torque, and the beam's length and density."
@@ -490,9 +492,11 @@ def write_session(
             sample_block["t_ns"] = np.rint(np.multiply(sample_block["tick"], 1e9 / rate_hz))
             writer.write_samples(encode_samples(sample_block))
         scheduled_ticks = int(ticks[-1]) + 1
-        counts = {"scheduled": scheduled_ticks, "recorded": len(ticks), "missed": 0}
-        counts["lost"] = scheduled_ticks - len(ticks)
-        writer.close({count_name: str(row_count) for count_name, row_count in counts.items()})
+        sample_counts = {"scheduled": scheduled_ticks, "recorded": len(ticks), "missed": 0}
+        sample_counts["lost"] = scheduled_ticks - len(ticks)
+        writer.close(
+            {count_name: str(row_count) for count_name, row_count in sample_counts.items()}
+        )
     except BaseException:
         # The source still exists, so an incomplete copy of it is useless.
         try:

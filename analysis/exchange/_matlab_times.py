@@ -23,7 +23,7 @@ _PERIOD_NAMES: Final = (
 """Names, in lower case, of variables with a sample period in seconds."""
 
 
-def states_time(field_name: str) -> bool:
+def is_name_of_times(field_name: str) -> bool:
     """Return whether a variable or field of this name contains times, a rate or a sample period."""
     return is_title_of_times(field_name) or field_name.lower() in _RATE_NAMES + _PERIOD_NAMES
 
@@ -32,7 +32,7 @@ def stated_times(
     channel_name: str,
     channel_names: Sequence[str],
     sample_count: int,
-    sibling_names: Callable[[str], Iterable[str]],
+    list_sibling_names: Callable[[str], Iterable[str]],
     read_vector: Callable[[str], NDArray[Any]],
 ) -> tuple[float | None, FileTimes | None]:
     """Return sampling rate and times of a channel, from the innermost struct that states either.
@@ -47,9 +47,9 @@ def stated_times(
         parent_name = parent_name.rpartition(".")[0]
         rate_hz: float | None = None
         file_times: FileTimes | None = None
-        for field_name in sibling_names(parent_name):
+        for field_name in list_sibling_names(parent_name):
             sibling_name = f"{parent_name}.{field_name}" if parent_name else field_name
-            if sibling_name in channel_names or not states_time(field_name):
+            if sibling_name in channel_names or not is_name_of_times(field_name):
                 continue
             try:
                 sibling_values = read_vector(sibling_name)

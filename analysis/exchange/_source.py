@@ -111,11 +111,11 @@ class ImportFormat:
     max_bytes: int
 
 
-def _shipped(name: str, module: str, max_bytes: int) -> ImportFormat:
+def _shipped_format(name: str, module_name: str, max_bytes: int) -> ImportFormat:
     """Return a format of this package; its module is imported when the first file is read."""
 
     def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
-        read_channels: ReadChannels = import_module(f"analysis.exchange.{module}").read
+        read_channels: ReadChannels = import_module(f"analysis.exchange.{module_name}").read
         return read_channels(path, channel_names)
 
     return ImportFormat(name, read, max_bytes)
@@ -140,20 +140,20 @@ def _load_format(plugin: Plugin) -> ImportFormat:
     return file_format
 
 
-_FORMATS: Final = Registry(
+_IMPORT_FORMATS: Final = Registry(
     "analysis.formats",
     {
-        "csv": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-        "txt": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-        "dat": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-        "tsv": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-        "asc": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-        "lvm": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-        "mat": _shipped("MATLAB", "_matlab_format", 512 * _MEGABYTE),
-        "tdms": _shipped("TDMS", "_tdms_format", 512 * _MEGABYTE),
-        "uff": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
-        "unv": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
-        "uf58": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
+        "csv": _shipped_format("CSV", "_csv_format", 512 * _MEGABYTE),
+        "txt": _shipped_format("CSV", "_csv_format", 512 * _MEGABYTE),
+        "dat": _shipped_format("CSV", "_csv_format", 512 * _MEGABYTE),
+        "tsv": _shipped_format("CSV", "_csv_format", 512 * _MEGABYTE),
+        "asc": _shipped_format("CSV", "_csv_format", 512 * _MEGABYTE),
+        "lvm": _shipped_format("CSV", "_csv_format", 512 * _MEGABYTE),
+        "mat": _shipped_format("MATLAB", "_matlab_format", 512 * _MEGABYTE),
+        "tdms": _shipped_format("TDMS", "_tdms_format", 512 * _MEGABYTE),
+        "uff": _shipped_format("UFF58", "_uff_format", 128 * _MEGABYTE),
+        "unv": _shipped_format("UFF58", "_uff_format", 128 * _MEGABYTE),
+        "uf58": _shipped_format("UFF58", "_uff_format", 128 * _MEGABYTE),
     },
     _load_format,
 )
@@ -187,17 +187,17 @@ def read_source(
     """
     suffix = path.suffix.lower().removeprefix(".")
     try:
-        owner, file_format = _FORMATS.owner(suffix), _FORMATS.get(suffix)
+        owner, file_format = _IMPORT_FORMATS.owner(suffix), _IMPORT_FORMATS.get(suffix)
     except PluginError as error:
         raise ExchangeError(f"{path}: {error}") from error
     if file_format is None:
         raise ExchangeError(
             f"{path}: the ending of the name selects the format; give a file that ends in one of "
-            f"{', '.join(f'.{name}' for name in _FORMATS.names())}."
+            f"{', '.join(f'.{name}' for name in _IMPORT_FORMATS.names())}."
         )
     _check_file(path, file_format)
     try:
-        channels = _read_checked(file_format, owner, path, channel_names)
+        channels = _read_checked_channels(file_format, owner, path, channel_names)
     except OSError as error:
         raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except MemoryError as error:
@@ -212,11 +212,11 @@ def read_source(
             raise ExchangeError(
                 f"{path}: '{channel_name}' has {sample_count} samples, too few for a record."
             )
-        check_samples(path, f"The channel '{channel_name}'", sample_count)
+        check_sample_count(path, f"The channel '{channel_name}'", sample_count)
     return file_format.name, channels
 
 
-def _read_checked(
+def _read_checked_channels(
     file_format: ImportFormat, owner: Plugin | None, path: Path, channel_names: Sequence[str]
 ) -> Mapping[str, SourceChannel]:
     """Return the channels of a file; check them if an installed package has read them."""
@@ -230,14 +230,16 @@ def _read_checked(
         raise ExchangeError(f"{path}: {error}") from error
 
 
-def _checked_channel(path: Path, name: str, channel: SourceChannel) -> SourceChannel:
+def _checked_channel(path: Path, channel_name: str, channel: SourceChannel) -> SourceChannel:
     """Return a channel read by an installed package, with real values; raise unless it is valid."""
-    values = real_vector(path, name, np.asarray(channel.values))
+    values = real_vector(path, channel_name, np.asarray(channel.values))
     if values.ndim != 1:
-        raise ExchangeError(f"{path}: the channel '{name}' has {values.ndim} dimensions, not one.")
+        raise ExchangeError(
+            f"{path}: the channel '{channel_name}' has {values.ndim} dimensions, not one."
+        )
     rate_hz = channel.rate_hz
     if rate_hz is not None and not (rate_hz > 0 and np.isfinite(rate_hz)):
-        raise ExchangeError(f"{path}: the channel '{name}' has a rate of {rate_hz} Hz.")
+        raise ExchangeError(f"{path}: the channel '{channel_name}' has a rate of {rate_hz} Hz.")
     return replace(channel, values=values)
 
 
@@ -249,7 +251,7 @@ def check_format_plugin(plugin: Plugin) -> str:
     PluginError
         If the format cannot be used.
     """
-    return f"{_FORMATS.load(plugin).name}, import of .{plugin.name}"
+    return f"{_IMPORT_FORMATS.load(plugin).name}, import of .{plugin.name}"
 
 
 def _check_file(path: Path, file_format: ImportFormat) -> None:
@@ -309,10 +311,10 @@ def bounded_memory(extra_bytes: int = MAX_MEMORY_BYTES) -> Iterator[None]:
         yield
         return
     soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_AS)
-    new_limit = page_count * resource.getpagesize() + extra_bytes
+    new_limit_bytes = page_count * resource.getpagesize() + extra_bytes
     memory_limits = [
         memory_limit
-        for memory_limit in (soft_limit, hard_limit, new_limit)
+        for memory_limit in (soft_limit, hard_limit, new_limit_bytes)
         if memory_limit != resource.RLIM_INFINITY
     ]
     resource.setrlimit(resource.RLIMIT_AS, (min(memory_limits), hard_limit))
@@ -322,12 +324,12 @@ def bounded_memory(extra_bytes: int = MAX_MEMORY_BYTES) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft_limit, hard_limit))
 
 
-def check_samples(path: Path, channel_text: str, samples: int) -> None:
+def check_sample_count(path: Path, channel_text: str, sample_count: int) -> None:
     """Raise if a channel has, or claims to have, more than `MAX_SAMPLES` samples."""
-    if samples > MAX_SAMPLES:
+    if sample_count > MAX_SAMPLES:
         raise ExchangeError(
-            f"{path}: {channel_text} has {samples} samples, more than the {MAX_SAMPLES} that are "
-            "read; cut "
+            f"{path}: {channel_text} has {sample_count} samples, more than the {MAX_SAMPLES} "
+            "that are read; cut "
             "the session out of the file first."
         )
 
@@ -367,12 +369,12 @@ def channel_index(
     titles: Sequence[str],
     duplicates_text: str,
     *,
-    numbered: bool = False,
+    list_numbers: bool = False,
 ) -> int:
     """Return the index of a channel that is given by its title or by its number, as ``#3``.
 
     `titles` are the titles of all channels in the file. The message about several channels of one
-    title contains `duplicates_text`, such as "columns are named". `numbered` states whether
+    title contains `duplicates_text`, such as "columns are named". `list_numbers` states whether
     messages list the titles with their numbers. Raise ExchangeError unless there is exactly one
     such channel.
     """
@@ -384,38 +386,38 @@ def channel_index(
             f"{path}: {title_count} {duplicates_text} '{channel_name}'; give the number, such as "
             f"#{titles.index(channel_name) + 1} for the first of them."
         )
-    number_text = channel_name.removeprefix("#")
+    channel_number_text = channel_name.removeprefix("#")
     if (
-        channel_name != number_text
-        and number_text.isdecimal()
-        and 0 < int(number_text) <= len(titles)
+        channel_name != channel_number_text
+        and channel_number_text.isdecimal()
+        and 0 < int(channel_number_text) <= len(titles)
     ):
-        return int(number_text) - 1
+        return int(channel_number_text) - 1
     listed_titles = (
         [f"#{channel_number} {title}" for channel_number, title in enumerate(titles, 1)]
-        if numbered
+        if list_numbers
         else titles
     )
     raise no_such_channel_error(path, channel_name, listed_titles)
 
 
-def real_vector(path: Path, name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:
+def real_vector(path: Path, channel_name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:
     """Return real numbers as a vector of floats; raise if the values are not real numbers."""
     if values.dtype.kind == "c":
-        raise not_in_time_error(path, name)
+        raise not_in_time_error(path, channel_name)
     if values.dtype.kind not in "iuf":
         raise ExchangeError(
-            f"{path}: the channel '{name}' does not hold real numbers but {values.dtype.name}; "
-            "choose a channel of measured values."
+            f"{path}: the channel '{channel_name}' does not hold real numbers but "
+            f"{values.dtype.name}; choose a channel of measured values."
         )
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def not_in_time_error(path: Path, name: str) -> ExchangeError:
+def not_in_time_error(path: Path, channel_name: str) -> ExchangeError:
     """Return the error for a complex channel, which is no function of time."""
     return ExchangeError(
-        f"{path}: '{name}' is complex, so it is a frequency response or a spectrum. A session is "
-        "made of measured samples: give angle and torque over time; a record cannot be "
+        f"{path}: '{channel_name}' is complex, so it is a frequency response or a spectrum. A "
+        "session is made of measured samples: give angle and torque over time; a record cannot be "
         "reconstructed from a frequency response alone."
     )
 

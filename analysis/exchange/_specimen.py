@@ -80,7 +80,9 @@ def read_specimen(path: Path) -> SpecimenFile:
         _read_section(path, file_content, section_name)
         for section_name in ("rig", "beam", "sensor", "uncertainty")
     )
-    read_percent = partial(_number_in_range, path, "uncertainty", uncertainty_section, low=0.0)
+    read_percent = partial(
+        _number_in_range, path, "uncertainty", uncertainty_section, min_value=0.0
+    )
     tool_inertia_kg_m2 = 0.0
     if "tool_inertia_kg_m2" in sensor_section:
         tool_inertia_kg_m2 = _required_number(path, "sensor", sensor_section, "tool_inertia_kg_m2")
@@ -99,18 +101,24 @@ def read_specimen(path: Path) -> SpecimenFile:
         {
             quantity: percent_value
             for quantity in UNCERTAIN_QUANTITIES
-            if (percent_value := read_percent(f"{quantity}_percent", high=MAX_UNCERTAINTY_PERCENT))
+            if (
+                percent_value := read_percent(
+                    f"{quantity}_percent", max_value=MAX_UNCERTAINTY_PERCENT
+                )
+            )
             is not None
         },
-        read_percent("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
-        _number_in_range(path, "beam", beam_section, "tip_mass_kg", low=0.0, high=MAX_TIP_MASS_KG),
+        read_percent("uniformity_percent", max_value=MAX_UNIFORMITY_PERCENT),
+        _number_in_range(
+            path, "beam", beam_section, "tip_mass_kg", min_value=0.0, max_value=MAX_TIP_MASS_KG
+        ),
         _number_in_range(
             path,
             "rig",
             rig_section,
             "axis_tilt_deg",
-            low=-MAX_AXIS_TILT_DEG,
-            high=MAX_AXIS_TILT_DEG,
+            min_value=-MAX_AXIS_TILT_DEG,
+            max_value=MAX_AXIS_TILT_DEG,
         ),
     )
 
@@ -136,16 +144,22 @@ def _positive_number(path: Path, section: Mapping[str, Any], key: str) -> float:
 
 
 def _number_in_range(
-    path: Path, section_name: str, section: Mapping[str, Any], key: str, *, low: float, high: float
+    path: Path,
+    section_name: str,
+    section: Mapping[str, Any],
+    key: str,
+    *,
+    min_value: float,
+    max_value: float,
 ) -> float | None:
     """Return an optional number of a section, or None if absent; raise if it is out of range."""
     if key not in section:
         return None
     number = _required_number(path, section_name, section, key)
-    if not low <= number <= high:
+    if not min_value <= number <= max_value:
         raise ExchangeError(
             f"{path}: {section_name}.{key} is {number:g} {unit_of(key)}, but must lie between "
-            f"{low:g} and {high:g}."
+            f"{min_value:g} and {max_value:g}."
         )
     return number
 

@@ -109,7 +109,7 @@ def record_table(path: Path) -> ExportTable:
             for field_name in SAMPLE_FIELDS
             if field_name in _COLUMN_TITLES
         ),
-        {**session.metadata, **_segment_texts(session.segments), **_origin_information(path)},
+        {**session.metadata, **_segment_texts(session.segments), **_file_origin_information(path)},
     )
 
 
@@ -150,14 +150,14 @@ def frf_table(
             "beam_length_m": repr(record.beam.length_m),
             "beam_density_kg_per_m": repr(record.beam.density_kg_per_m),
             "beam_bending_stiffness_n_m2": repr(record.beam.bending_stiffness_n_m2),
-            **_origin_information(path),
+            **_file_origin_information(path),
         },
     )
 
 
-def _ascii_unit(name: str) -> str:
+def _ascii_unit(column_name: str) -> str:
     """Return the unit of a field in ASCII, as written to files."""
-    return unit_of(name).replace("·", ".")
+    return unit_of(column_name).replace("·", ".")
 
 
 def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
@@ -168,6 +168,6 @@ def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
     }
 
 
-def _origin_information(path: Path) -> dict[str, str]:
+def _file_origin_information(path: Path) -> dict[str, str]:
     """Return the names of the session file and of the exporting program."""
     return {"session_file": path.name, "exported_by": f"rigd {rigd.__version__}"}

@@ -15,7 +15,7 @@ from analysis.exchange._source import (
     FileTimes,
     SourceChannel,
     bounded_memory,
-    check_samples,
+    check_sample_count,
     missing_library_error,
     no_such_channel_error,
     real_vector,
@@ -31,9 +31,9 @@ _MAX_LISTED_CHANNELS: Final = 5_000_000
 """Largest number of channel entries in all segments together, because npTDMS processes all of them
 before it reads a value."""
 
-_EARLIEST_START: Final = np.datetime64("1980-01-01")
+_EARLIEST_START_TIME: Final = np.datetime64("1980-01-01")
 """Earliest valid start time; LabVIEW writes its origin, in 1904, if no start time was given."""
-_EARLIEST_START_NS: Final = int(_EARLIEST_START.astype("datetime64[ns]").astype(np.int64))
+_EARLIEST_START_NS: Final = int(_EARLIEST_START_TIME.astype("datetime64[ns]").astype(np.int64))
 """Earliest valid start time in nanoseconds since 1970."""
 
 _LEAD_IN_BYTES: Final = 28
@@ -57,7 +57,7 @@ def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel
     log_manager.set_level(logging.ERROR)  # its warnings are reported below
     try:
         with path.open("rb") as stream:
-            _check_entries(path, stream)
+            _check_listed_channel_count(path, stream)
             with bounded_memory(), TdmsFile.open(stream) as tdms_file:
                 channels_by_name = {
                     f"{tdms_group.name}/{channel.name}": channel
@@ -94,11 +94,13 @@ def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel
         ) from error
 
 
-def _check_entries(path: Path, stream: BinaryIO) -> None:
+def _check_listed_channel_count(path: Path, stream: BinaryIO) -> None:
     """Raise if the table of contents would take minutes or gigabytes to read."""
-    file_bytes = path.stat().st_size
-    segment_offset = total_channels = entry_count = 0
-    while segment_offset + _LEAD_IN_BYTES <= file_bytes and entry_count <= _MAX_LISTED_CHANNELS:
+    file_size_bytes = path.stat().st_size
+    segment_offset = total_channels = listed_count = 0
+    while (
+        segment_offset + _LEAD_IN_BYTES <= file_size_bytes and listed_count <= _MAX_LISTED_CHANNELS
+    ):
         stream.seek(segment_offset)
         lead_in = stream.read(_LEAD_IN_BYTES + 4)
         contents_mask = int.from_bytes(lead_in[4:8], "little")
@@ -109,11 +111,11 @@ def _check_entries(path: Path, stream: BinaryIO) -> None:
             total_channels = (
                 channel_count if contents_mask & _NEW_LIST else total_channels + channel_count
             )
-            entry_count += total_channels
-        entry_count += 1
+            listed_count += total_channels
+        listed_count += 1
         segment_offset += _LEAD_IN_BYTES + segment_bytes
     stream.seek(0)
-    if entry_count > _MAX_LISTED_CHANNELS:
+    if listed_count > _MAX_LISTED_CHANNELS:
         raise ExchangeError(
             f"{path}: its segments list more than {_MAX_LISTED_CHANNELS} channels in all, so it "
             "is "
@@ -122,36 +124,36 @@ def _check_entries(path: Path, stream: BinaryIO) -> None:
 
 
 def _read_channel(
-    path: Path, name: str, channels: Mapping[str, Any], is_cut_off: bool
+    path: Path, channel_name: str, channels: Mapping[str, Any], is_cut_off: bool
 ) -> SourceChannel:
     """Return one channel of a TDMS file.
 
     If `is_cut_off`, the end of the file is missing, and the channel gets a remark on that.
     """
-    channel = channels.get(name)
+    channel = channels.get(channel_name)
     if channel is None:
-        raise no_such_channel_error(path, name, channels)
-    check_samples(path, f"The channel '{name}'", len(channel))
-    properties = channel.properties
-    channel_values, unit_label = channel[:], str(properties.get("unit_string", ""))
+        raise no_such_channel_error(path, channel_name, channels)
+    check_sample_count(path, f"The channel '{channel_name}'", len(channel))
+    channel_properties = channel.properties
+    channel_values, unit_label = channel[:], str(channel_properties.get("unit_string", ""))
     if channel_values.dtype.kind == "M":  # LabVIEW's time stamps
         channel_values, unit_label = (
             (channel_values - channel_values[:1]) / np.timedelta64(1, "s"),
             "s",
         )
-    axis_unit = str(properties.get("wf_xunit_string", "")).strip()
+    axis_unit = str(channel_properties.get("wf_xunit_string", "")).strip()
     if _plain_lower_case(axis_unit) in _FREQUENCY_UNITS:
         raise ExchangeError(
-            f"{path}: '{name}' is a function of frequency (its wf_xunit_string is '{axis_unit}'), "
-            "not of time; give measured samples."
+            f"{path}: '{channel_name}' is a function of frequency (its wf_xunit_string is "
+            f"'{axis_unit}'), not of time; give measured samples."
         )
     unit_s = time_unit_s(axis_unit) or 1.0
     return SourceChannel(
-        real_vector(path, name, channel_values),
-        unit_label=unit_label or str(properties.get("NI_UnitDescription", "")),
-        rate_hz=_rate_hz(properties.get("wf_increment"), unit_s),
+        real_vector(path, channel_name, channel_values),
+        unit_label=unit_label or str(channel_properties.get("NI_UnitDescription", "")),
+        rate_hz=_rate_hz(channel_properties.get("wf_increment"), unit_s),
         remark="The file's end is missing: its recording was cut off." if is_cut_off else "",
-        start_ns=_start_ns(properties, unit_s),
+        start_ns=_start_ns(channel_properties, unit_s),
     )
 
 
@@ -164,20 +166,23 @@ def _plain_lower_case(text: str) -> str:
     return text.strip(" []()").lower()
 
 
-def _rate_hz(increment: object, unit_s: float) -> float | None:
+def _rate_hz(sample_increment: object, unit_s: float) -> float | None:
     """Return the sampling rate in Hz for a time step in units of `unit_s`; None if not valid."""
-    if not isinstance(increment, int | float) or not 0 < increment < math.inf:
+    if not isinstance(sample_increment, int | float) or not 0 < sample_increment < math.inf:
         return None
-    return 1 / (increment * unit_s)
+    return 1 / (sample_increment * unit_s)
 
 
-def _start_ns(properties: Mapping[str, Any], unit_s: float) -> int | None:
+def _start_ns(channel_properties: Mapping[str, Any], unit_s: float) -> int | None:
     """Return the time of the first sample in ns, from start time and offset; None if not stated."""
-    start_time, offset_s = properties.get("wf_start_time"), properties.get("wf_start_offset")
+    start_time, offset_s = (
+        channel_properties.get("wf_start_time"),
+        channel_properties.get("wf_start_offset"),
+    )
     start_time_ns = 0
-    if isinstance(start_time, np.datetime64) and start_time >= _EARLIEST_START:
+    if isinstance(start_time, np.datetime64) and start_time >= _EARLIEST_START_TIME:
         start_time_ns = int(start_time.astype("datetime64[ns]").astype(np.int64))
-    elif offset_s is None and "wf_increment" not in properties:
+    elif offset_s is None and "wf_increment" not in channel_properties:
         return None
     if not isinstance(offset_s, int | float) or not math.isfinite(offset_s):
         offset_s = 0.0

@@ -18,7 +18,7 @@ from analysis.exchange._source import (
     SourceChannel,
     bounded_memory,
     channel_index,
-    check_samples,
+    check_sample_count,
     missing_library_error,
     not_in_time_error,
     real_vector,
@@ -45,9 +45,9 @@ _MAX_DATA_SETS: Final = 10_000
 """Largest number of data sets in a file that is read."""
 _SET_DELIMITER: Final = b"    -1"
 """Line that begins and ends each data set."""
-_TIME_CODE: Final = 17
+_TIME_AXIS_CODE: Final = 17
 """Code of a time axis; its unit is the second in every system of units."""
-_STEP_TOLERANCE: Final = 1e-3
+_RELATIVE_STEP_TOLERANCE: Final = 1e-3
 """Largest difference between the time steps of two data sets, relative to the step."""
 
 
@@ -78,27 +78,28 @@ def _read_channels(
     """Return the requested channels from their data sets."""
     _check_set_count(path)
     uff_file = open_file(str(path))
-    set_numbers = [
+    channel_set_numbers = [
         set_number for set_number, set_type in enumerate(uff_file.get_set_types()) if set_type == 58
     ]
     set_titles = [
-        uff_file.read_sets(set_number, header_only=True)["id1"] for set_number in set_numbers
+        uff_file.read_sets(set_number, header_only=True)["id1"]
+        for set_number in channel_set_numbers
     ]
-    number_by_name = {
+    set_index_by_channel = {
         channel_name: channel_index(
-            path, channel_name, set_titles, "data sets have the title", numbered=True
+            path, channel_name, set_titles, "data sets have the title", list_numbers=True
         )
         for channel_name in channel_names
         if channel_name != ABSCISSA
     }
-    if not number_by_name:
+    if not set_index_by_channel:
         raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was requested.")
     channels, abscissae, abscissa_units = {}, [], []
-    for channel_name, set_number in number_by_name.items():
-        data_set = uff_file.read_sets(set_numbers[set_number])
+    for channel_name, set_number in set_index_by_channel.items():
+        data_set = uff_file.read_sets(channel_set_numbers[set_number])
         set_abscissae = np.asarray(data_set["x"], dtype=np.float64)
         channels[channel_name] = _source_channel(
-            path, channel_name, data_set, set_abscissae, timed=ABSCISSA in channel_names
+            path, channel_name, data_set, set_abscissae, is_time_requested=ABSCISSA in channel_names
         )
         abscissae.append(set_abscissae)
         abscissa_units.append(_abscissa_unit(data_set))
@@ -107,7 +108,7 @@ def _read_channels(
         channels[ABSCISSA] = SourceChannel(
             _common_times(path, channels, abscissae),
             unit_label=abscissa_units[0],
-            rate_hz=None if abscissa_units[0] else _even_rate_hz(data_set, 1.0),
+            rate_hz=None if abscissa_units[0] else _evenly_spaced_rate_hz(data_set, 1.0),
             start_ns=first_channel.start_ns,
         )
     return channels
@@ -124,47 +125,50 @@ def _check_set_count(path: Path) -> None:
 
 def _source_channel(
     path: Path,
-    name: str,
+    channel_name: str,
     data_set: Mapping[str, Any],
     set_abscissae: NDArray[np.float64],
     *,
-    timed: bool,
+    is_time_requested: bool,
 ) -> SourceChannel:
     """Return a data set as a channel; `set_abscissae` are its times.
 
-    If `timed`, the user requests the abscissae as a channel of times, so the channel states no
-    rate and no times of its own.
+    If `is_time_requested`, the user requests the abscissae as a channel of times, so the channel
+    states no rate and no times of its own.
     """
     set_values = np.asarray(data_set["data"])
     if set_values.dtype.kind == "c":
-        raise not_in_time_error(path, name)
+        raise not_in_time_error(path, channel_name)
     abscissa_unit = _abscissa_unit(data_set)
-    _check_time_response(path, name, data_set, abscissa_unit)
+    _check_function_of_time(path, channel_name, data_set, abscissa_unit)
     if len(set_values) != data_set["num_pts"]:
         raise ExchangeError(
-            f"{path}: '{name}' has {len(set_values)} values and states {data_set['num_pts']}; the "
+            f"{path}: '{channel_name}' has {len(set_values)} values and states "
+            f"{data_set['num_pts']}; the "
             "file is damaged or was written incorrectly; export it again."
         )
-    check_samples(path, f"The data set '{name}'", len(set_values))
+    check_sample_count(path, f"The data set '{channel_name}'", len(set_values))
     unit_s = time_unit_s(abscissa_unit)
-    is_time = unit_s is not None or data_set["abscissa_spec_data_type"] == _TIME_CODE
-    is_even = data_set["abscissa_spacing"] == 1
+    is_time_axis = unit_s is not None or data_set["abscissa_spec_data_type"] == _TIME_AXIS_CODE
+    is_evenly_spaced = data_set["abscissa_spacing"] == 1
     start_s = float(set_abscissae[0]) * (unit_s or 1.0) if len(set_abscissae) else math.nan
     unit_label = _label_text(data_set, "ordinate_axis_units_lab")
     return SourceChannel(
-        real_vector(path, name, set_values),
+        real_vector(path, channel_name, set_values),
         unit_label=unit_label or stated_unit_of(_label_text(data_set, "ordinate_axis_lab")),
-        rate_hz=_even_rate_hz(data_set, unit_s or 1.0) if is_time and not timed else None,
+        rate_hz=_evenly_spaced_rate_hz(data_set, unit_s or 1.0)
+        if is_time_axis and not is_time_requested
+        else None,
         start_ns=round(start_s * 1e9) if math.isfinite(start_s) else None,
         times=FileTimes(ABSCISSA, set_abscissae, unit_s)
-        if is_time and not is_even and not timed
+        if is_time_axis and not is_evenly_spaced and not is_time_requested
         else None,
     )
 
 
-def _label_text(data_set: Mapping[str, Any], key: str) -> str:
+def _label_text(data_set: Mapping[str, Any], label_key: str) -> str:
     """Return a label of a data set, or an empty text if it has none."""
-    label_text = str(data_set.get(key) or "").strip()
+    label_text = str(data_set.get(label_key) or "").strip()
     return "" if label_text.upper() == "NONE" else label_text
 
 
@@ -175,43 +179,48 @@ def _abscissa_unit(data_set: Mapping[str, Any]) -> str:
     )
 
 
-def _even_rate_hz(data_set: Mapping[str, Any], unit_s: float) -> float | None:
+def _evenly_spaced_rate_hz(data_set: Mapping[str, Any], unit_s: float) -> float | None:
     """Return the sampling rate of a data set with equidistant abscissae, or else None."""
     increment_s = data_set["abscissa_inc"] * unit_s if data_set["abscissa_spacing"] == 1 else 0.0
     return 1 / increment_s if increment_s > 0 else None
 
 
-def _check_time_response(path: Path, name: str, data_set: Mapping[str, Any], unit: str) -> None:
+def _check_function_of_time(
+    path: Path, channel_name: str, data_set: Mapping[str, Any], abscissa_unit: str
+) -> None:
     """Raise if a data set is a spectrum or another function that is not of time."""
     function_type, axis_type = data_set["func_type"], data_set["abscissa_spec_data_type"]
     axis_label = _label_text(data_set, "abscissa_axis_lab")
     contradiction = ""
     if function_type not in (_GENERAL_FUNCTION, _TIME_RESPONSE):
         contradiction = (
-            f"its function type is {function_type}{_code_name(function_type, _FUNCTION_TYPES)}"
+            "its function type is "
+            f"{function_type}{_code_name_suffix(function_type, _FUNCTION_TYPE_NAMES)}"
         )
-    elif axis_type not in (_UNKNOWN_AXIS, _GENERAL_AXIS, _TIME_CODE):
+    elif axis_type not in (_UNKNOWN_AXIS, _GENERAL_AXIS, _TIME_AXIS_CODE):
         contradiction = (
-            f"its abscissa is of type {axis_type}{_code_name(axis_type, _ABSCISSA_TYPES)}"
+            "its abscissa is of type "
+            f"{axis_type}{_code_name_suffix(axis_type, _ABSCISSA_TYPE_NAMES)}"
         )
-    elif axis_type != _TIME_CODE and (
-        unit.lower() in ("hz", "khz", "rpm", "rad/s") or axis_label.lower().startswith("freq")
+    elif axis_type != _TIME_AXIS_CODE and (
+        abscissa_unit.lower() in ("hz", "khz", "rpm", "rad/s")
+        or axis_label.lower().startswith("freq")
     ):
-        contradiction = f"its abscissa is '{axis_label or unit}'"
+        contradiction = f"its abscissa is '{axis_label or abscissa_unit}'"
     if contradiction:
         raise ExchangeError(
-            f"{path}: '{name}' is not a function of time: {contradiction}. A session is made of "
-            "measured "
+            f"{path}: '{channel_name}' is not a function of time: {contradiction}. A session is "
+            "made of measured "
             "samples: give angle and torque over time."
         )
 
 
-def _code_name(code: int, code_names: Mapping[int, str]) -> str:
+def _code_name_suffix(code: int, code_names: Mapping[int, str]) -> str:
     """Return the name of a code in parentheses, or an empty text if it has no name."""
     return f" ({code_names[code]})" if code in code_names else ""
 
 
-_FUNCTION_TYPES: Final = {
+_FUNCTION_TYPE_NAMES: Final = {
     2: "auto spectrum",
     3: "cross spectrum",
     4: "frequency response",
@@ -226,7 +235,7 @@ _FUNCTION_TYPES: Final = {
     13: "cumulative distribution",
 }
 """Names of function types that are not functions of time, by their codes."""
-_ABSCISSA_TYPES: Final = {18: "frequency", 19: "rpm", 20: "order"}
+_ABSCISSA_TYPE_NAMES: Final = {18: "frequency", 19: "rpm", 20: "order"}
 """Names of abscissa types that are not times, by their codes."""
 
 
@@ -251,7 +260,9 @@ def _common_times(
         mean_step = (
             np.median(np.diff(abscissae_of_sets[0])) if len(abscissae_of_sets[0]) > 1 else 0.0
         )
-        step_differs = bool(np.abs(step_differences).max(initial=0.0) > _STEP_TOLERANCE * mean_step)
+        step_differs = bool(
+            np.abs(step_differences).max(initial=0.0) > _RELATIVE_STEP_TOLERANCE * mean_step
+        )
         if not np.array_equal(set_times, abscissae_of_sets[0]) and (
             step_differs or set_start is None or first_start == set_start
         ):
@@ -304,10 +315,12 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     """
     abscissae = np.asarray(table.axis.values, dtype=np.float64)
     if binary:
-        is_even = _is_reproducible(abscissae, _BINARY_TOLERANCE) and _is_increment_exact(abscissae)
+        is_evenly_spaced = _is_reproducible(abscissae, _BINARY_TOLERANCE) and _is_increment_exact(
+            abscissae
+        )
     else:
-        is_even = _is_reproducible(abscissae, _TEXT_TOLERANCE)
-    if not is_even and not binary and not _are_abscissae_distinct(abscissae):
+        is_evenly_spaced = _is_reproducible(abscissae, _TEXT_TOLERANCE)
+    if not is_evenly_spaced and not binary and not _are_abscissae_distinct(abscissae):
         raise ExchangeError(
             f"{table.source}: its {table.axis.title.lower()} is not equidistant enough for UFF58 "
             "in text, which has six digits for it; write it with --binary, or as .csv or .mat."
@@ -315,44 +328,46 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     stream.write(_SI_UNITS_SET.encode("ascii"))
     for column in table.columns:
         if column.values.dtype.kind in "fc":
-            encoded_values = _encode_body(abscissae, column.values, is_even=is_even, binary=binary)
+            encoded_values = _encode_body(
+                abscissae, column.values, is_evenly_spaced=is_evenly_spaced, binary=binary
+            )
             header_text = _header_text(
-                table, abscissae, column, is_even, len(encoded_values) if binary else None
+                table, abscissae, column, is_evenly_spaced, len(encoded_values) if binary else None
             )
             stream.write(header_text.encode("ascii") + encoded_values + b"    -1\n")
 
 
-def _is_reproducible(abscissae: NDArray[np.float64], tolerance: float) -> bool:
+def _is_reproducible(abscissae: NDArray[np.float64], relative_tolerance: float) -> bool:
     """Return whether first abscissa and increment, rounded to six digits, reproduce each abscissa.
 
-    `tolerance` is the largest permitted error, as a fraction of the increment.
+    `relative_tolerance` is the largest permitted error, as a fraction of the increment.
     """
     if len(abscissae) < 2:
         return True
-    first_abscissa, increment = _start_and_increment(abscissae)
-    read_abscissae = float(f"{first_abscissa:.5e}") + float(f"{increment:.5e}") * np.arange(
+    first_abscissa, increment = _first_abscissa_and_increment(abscissae)
+    rounded_abscissae = float(f"{first_abscissa:.5e}") + float(f"{increment:.5e}") * np.arange(
         len(abscissae)
     )
-    return bool(np.abs(read_abscissae - abscissae).max() <= tolerance * increment)
+    return bool(np.abs(rounded_abscissae - abscissae).max() <= relative_tolerance * increment)
 
 
 def _is_increment_exact(abscissae: NDArray[np.float64]) -> bool:
     """Return whether six digits state the increment exactly enough for a binary file."""
-    _, increment = _start_and_increment(abscissae)
+    _, increment = _first_abscissa_and_increment(abscissae)
     return abs(float(f"{increment:.5e}") - increment) <= _INCREMENT_TOLERANCE * increment
 
 
 def _are_abscissae_distinct(abscissae: NDArray[np.float64]) -> bool:
     """Return whether six digits are enough to write each abscissa as text."""
-    read_abscissae = np.array(
+    rounded_abscissae = np.array(
         [f"{abscissa:.5e}" for abscissa in abscissae.tolist()], dtype=np.float64
     )
     return bool(
-        np.abs(read_abscissae - abscissae).max() <= _TEXT_TOLERANCE * np.diff(abscissae).min()
+        np.abs(rounded_abscissae - abscissae).max() <= _TEXT_TOLERANCE * np.diff(abscissae).min()
     )
 
 
-def _start_and_increment(abscissae: NDArray[np.float64]) -> tuple[float, float]:
+def _first_abscissa_and_increment(abscissae: NDArray[np.float64]) -> tuple[float, float]:
     """Return the first abscissa and the mean increment."""
     if len(abscissae) < 2:
         return float(abscissae[0]), 0.0
@@ -363,11 +378,11 @@ def _encode_body(
     abscissae: NDArray[np.float64],
     column_values: NDArray[np.generic],
     *,
-    is_even: bool,
+    is_evenly_spaced: bool,
     binary: bool,
 ) -> bytes:
     """Return the encoded values of a function, with its abscissae unless these are equidistant."""
-    real_columns: list[NDArray[np.generic]] = [] if is_even else [abscissae]
+    real_columns: list[NDArray[np.generic]] = [] if is_evenly_spaced else [abscissae]
     real_columns += (
         [column_values.real, column_values.imag]
         if column_values.dtype.kind == "c"
@@ -377,20 +392,24 @@ def _encode_body(
     if binary:
         return number_table.tobytes()
     number_formats = ["%20.12E"] * number_table.shape[1]
-    if not is_even:
+    if not is_evenly_spaced:
         number_formats[0] = "%13.5E"
     # A line has four numbers, or three for complex values with their abscissa.
     rows_per_line = 1 if len(number_formats) == 3 else 4 // len(number_formats)
-    full_rows = len(number_table) - len(number_table) % rows_per_line
+    rows_in_full_lines = len(number_table) - len(number_table) % rows_per_line
     full_line, last_line = (
         "".join(number_formats * rows_per_line) + "\n",
-        "".join(number_formats * (len(number_table) - full_rows)),
+        "".join(number_formats * (len(number_table) - rows_in_full_lines)),
     )
     body_text = (
-        full_line * (full_rows // rows_per_line) % tuple(number_table[:full_rows].ravel().tolist())
+        full_line
+        * (rows_in_full_lines // rows_per_line)
+        % tuple(number_table[:rows_in_full_lines].ravel().tolist())
     )
     body_text += (
-        f"{last_line}\n" % tuple(number_table[full_rows:].ravel().tolist()) if last_line else ""
+        f"{last_line}\n" % tuple(number_table[rows_in_full_lines:].ravel().tolist())
+        if last_line
+        else ""
     )
     return body_text.encode("ascii")
 
@@ -399,8 +418,8 @@ def _header_text(
     table: ExportTable,
     abscissae: NDArray[np.float64],
     column: ExportColumn,
-    is_even: bool,
-    body_bytes: int | None,
+    is_evenly_spaced: bool,
+    body_length_bytes: int | None,
 ) -> str:
     """Return the header of a data set; `body_bytes` is the length of a binary body in bytes."""
     is_complex = column.values.dtype.kind == "c"
@@ -411,11 +430,13 @@ def _header_text(
         )
     else:
         function_type, axis_type = _TIME_RESPONSE, _TIME_AXIS
-    first_abscissa, increment = _start_and_increment(abscissae) if is_even else (0.0, 0.0)
+    first_abscissa, increment = (
+        _first_abscissa_and_increment(abscissae) if is_evenly_spaced else (0.0, 0.0)
+    )
     set_type = (
         "    58"
-        if body_bytes is None
-        else f"    58b{1:6d}{2:6d}{11:12d}{body_bytes:12d}{0:6d}{0:6d}{0:12d}{0:12d}"
+        if body_length_bytes is None
+        else f"    58b{1:6d}{2:6d}{11:12d}{body_length_bytes:12d}{0:6d}{0:6d}{0:12d}{0:12d}"
     )
     data_type = _COMPLEX_DOUBLE if is_complex else _REAL_DOUBLE
     quantity_title, _, divisor_title = column.title.partition(" / ")
@@ -425,7 +446,7 @@ def _header_text(
         f"{set_type:80}",
         *(f"{_ascii_text(line_text):80.80}" for line_text in _identification_lines(table, column)),
         f"{function_type:5d}{0:10d}{0:5d}{0:10d} {'NONE':10}{0:10d}{0:4d} {'NONE':10}{0:10d}{0:4d}",
-        f"{data_type:10d}{len(abscissae):10d}{int(is_even):10d}{first_abscissa:13.5E}{increment:13.5E}{0.0:13.5E}",
+        f"{data_type:10d}{len(abscissae):10d}{int(is_evenly_spaced):10d}{first_abscissa:13.5E}{increment:13.5E}{0.0:13.5E}",
         _axis_line(axis_type, (0, 0), table.axis.title, table.axis.unit),
         _axis_line(
             _GENERAL_AXIS, _UNIT_EXPONENTS.get(quantity_unit, (0, 0)), quantity_title, quantity_unit

@@ -32,7 +32,7 @@ def test_rate_and_ticks_are_recovered_from_times(rate_hz, start_s, samples, gap,
     np.testing.assert_array_equal(base.ticks, ticks)
     # The stamps are rounded to 1e-13 s by the start; over a short record that is all there is.
     assert base.rate_hz == pytest.approx(rate_hz, rel=1e-8 + 1e-12 * rate_hz)
-    assert base.missing == ticks[-1] + 1 - samples
+    assert base.missing_ticks == ticks[-1] + 1 - samples
 
 
 @pytest.mark.parametrize(("rate_hz", "digits"), [(1000, 3), (1000, 4), (600, 4), (1024, 6)])
@@ -75,7 +75,7 @@ def test_invalid_time_base_is_refused(times, words):
 
 def test_stated_rate_is_used_unchanged():
     base = uniform_timebase(PATH, 5, 512.5)
-    assert (base.ticks.tolist(), base.rate_hz, base.missing) == ([0, 1, 2, 3, 4], 512.5, 0)
+    assert (base.ticks.tolist(), base.rate_hz, base.missing_ticks) == ([0, 1, 2, 3, 4], 512.5, 0)
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, np.nan, np.inf, 1e9])
