@@ -321,7 +321,7 @@ def export_model_command(
     are stated over the band.
     """
     from analysis.exchange import export_model
-    from analysis.linear_model import DEFAULT_SAMPLES, INPUT_KINDS, ModelOptions
+    from analysis.linear_model import DEFAULT_POSTERIOR_SAMPLES, INPUT_KINDS, ModelOptions
     from rigd.printable import progress_bar
 
     model_options = ModelOptions(
@@ -329,7 +329,7 @@ def export_model_command(
         parse_option_choice(input_kind, INPUT_KINDS, "--input"),
         _parse_order(order),
         _parse_rate(rate),
-        DEFAULT_SAMPLES if samples is None else samples,
+        DEFAULT_POSTERIOR_SAMPLES if samples is None else samples,
     )
 
     def export_linear_model() -> None:
@@ -370,20 +370,20 @@ def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
     )
     text_lines = [
         f"Model: {model_name} of {source} (uniform beam: {uniformity_text}): {target}",
-        f"Order: {state_space.order} states ({model.structure.pairs} pairs of poles, "
+        f"Order: {state_space.order} states ({model.structure.pair_count} pairs of poles, "
         f"{relaxation_count} real poles); {time_text}",
         f"Input: {inputs_text}",
         f"Output: coupling_torque (N.m), delayed by {1e3 * state_space.delay_s:.4g} ms; the delay "
         "is not in the matrices",
-        f"Error: at most {accuracy.error_max:.1e} of the response, median "
-        f"{accuracy.error_median:.1e}, {band_text}",
+        f"Error: at most {accuracy.max_relative_error:.1e} of the response, median "
+        f"{accuracy.median_relative_error:.1e}, {band_text}",
     ]
-    if math.isnan(accuracy.std_max):
+    if math.isnan(accuracy.max_relative_std):
         text_lines.append("Data: the standard deviation is not known without a covariance")
     else:
         text_lines.append(
-            f"Data: standard deviation at most {accuracy.std_max:.1e} of the response, median "
-            f"{accuracy.std_median:.1e}, {band_text}"
+            f"Data: standard deviation at most {accuracy.max_relative_std:.1e} of the response, "
+            f"median {accuracy.median_relative_std:.1e}, {band_text}"
         )
     text_lines.append(
         f"Samples: {len(model.posterior.systems)} of the posterior, with the same states"

@@ -1,5 +1,5 @@
 from ._dynamics import LinearModelError as LinearModelError
-from ._exported import DEFAULT_SAMPLES as DEFAULT_SAMPLES
+from ._exported import DEFAULT_POSTERIOR_SAMPLES as DEFAULT_POSTERIOR_SAMPLES
 from ._exported import LinearModel as LinearModel
 from ._exported import ModelOptions as ModelOptions
 from ._exported import linear_model as linear_model

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from analysis.identify import ModalModel
     from rigd.beam import Plant
 
-Response = Callable[[NDArray[np.complex128]], NDArray[np.complex128]]
+ResponseFunction = Callable[[NDArray[np.complex128]], NDArray[np.complex128]]
 """Function from s in rad/s to a frequency response."""
 
 BEAM_BAND_HZ: Final = (0.05, 100.0)
@@ -59,12 +59,12 @@ class Dynamics:
     ----------
     response : callable
         Function from s (rad/s, not 0) to N·m/rad, without filters and delay of the torque channel.
-    pairs : ndarray of complex
+    pole_pairs : ndarray of complex
         Poles with positive imaginary part, in rad/s, of the conjugate pairs that a realisation may
         have. A realisation with n pairs has the first n.
-    names : tuple of str
+    pair_names : tuple of str
         Name of each pair.
-    in_band : int
+    pair_count_in_band : int
         Number of pairs within the band.
     band_hz : tuple of float
         Band in which the realisation has to be accurate.
@@ -74,30 +74,30 @@ class Dynamics:
         Inertia between sensor and beam, part of the response.
     motor_inertia_kg_m2 : float or None
         Inertia of a motor that the realisation must not make unstable; None if it may.
-    filters : tuple of (float, int)
+    torque_filters : tuple of (float, int)
         Time constant (s) and order of each low-pass filter in the torque channel.
     delay_s : float
         Delay of the torque relative to the angle.
     """
 
-    response: Response
-    pairs: NDArray[np.complex128]
-    names: tuple[str, ...]
-    in_band: int
+    response: ResponseFunction
+    pole_pairs: NDArray[np.complex128]
+    pair_names: tuple[str, ...]
+    pair_count_in_band: int
     band_hz: tuple[float, float]
     real_poles: tuple[float, ...] = ()
     tool_inertia_kg_m2: float = 0.0
     motor_inertia_kg_m2: float | None = None
-    filters: tuple[tuple[float, int], ...] = ()
+    torque_filters: tuple[tuple[float, int], ...] = ()
     delay_s: float = 0.0
 
-    def filtered(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def filtered_response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the response in N·m/rad with the filters of the torque channel, without delay.
 
         The points s are in rad/s.
         """
         filtered_response = self.response(s)
-        for time_constant_s, filter_order in self.filters:
+        for time_constant_s, filter_order in self.torque_filters:
             x = time_constant_s * s
             filtered_response = filtered_response / (
                 1 + x if filter_order == 1 else 1 + _BUTTERWORTH_COEFFICIENT * x + x * x
@@ -113,9 +113,9 @@ class UncertainDynamics:
     ----------
     dynamics_of : callable
         Function from parameters by name to dynamics.
-    names : tuple of str
+    parameter_names : tuple of str
         Names of the uncertain parameters. A name with ``ln_`` denotes a natural logarithm.
-    values : ndarray, shape (k,)
+    parameter_values : ndarray, shape (k,)
         Estimates of the parameters.
     covariance : ndarray, shape (k, k)
         Covariance of the estimates.
@@ -124,19 +124,19 @@ class UncertainDynamics:
     """
 
     dynamics_of: Callable[[Mapping[str, float]], Dynamics]
-    names: tuple[str, ...] = ()
-    values: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    parameter_names: tuple[str, ...] = ()
+    parameter_values: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     is_possible: Callable[[Mapping[str, float]], bool] = lambda _parameters: True
 
     @property
-    def nominal(self) -> Dynamics:
+    def nominal_dynamics(self) -> Dynamics:
         """Return the dynamics for the estimated values of the parameters."""
-        return self.dynamics_of(self.by_name(self.values))
+        return self.dynamics_of(self.parameters_by_name(self.parameter_values))
 
-    def by_name(self, parameter_values: NDArray[np.float64]) -> dict[str, float]:
-        """Return parameter values as a dict by name; they are in the order of `names`."""
-        return dict(zip(self.names, parameter_values.tolist(), strict=True))
+    def parameters_by_name(self, parameter_values: NDArray[np.float64]) -> dict[str, float]:
+        """Return parameter values as a dict by name; they are in the order of `parameter_names`."""
+        return dict(zip(self.parameter_names, parameter_values.tolist(), strict=True))
 
 
 # Beam
@@ -159,14 +159,14 @@ def beam_dynamics(plant: Plant) -> Dynamics:
     )
     return Dynamics(
         response=lambda s: ResponseGrid(s).evaluate(plant_without_channel)[0],
-        pairs=pole_pairs_rad_s,
-        names=tuple(f"mode_{mode_number}" for mode_number in mode_numbers),
-        in_band=int((pole_hz < BEAM_BAND_HZ[1]).sum()),
+        pole_pairs=pole_pairs_rad_s,
+        pair_names=tuple(f"mode_{mode_number}" for mode_number in mode_numbers),
+        pair_count_in_band=int((pole_hz < BEAM_BAND_HZ[1]).sum()),
         band_hz=BEAM_BAND_HZ,
         real_poles=real_poles,
         tool_inertia_kg_m2=plant.tool_inertia_kg_m2,
         motor_inertia_kg_m2=plant.beam.inertia_kg_m2,
-        filters=tuple(filter_entry for filter_entry in torque_filters if filter_entry[0]),
+        torque_filters=tuple(torque_filter for torque_filter in torque_filters if torque_filter[0]),
         delay_s=plant.delay_s,
     )
 
@@ -228,14 +228,14 @@ def modal_dynamics(
     )
     return Dynamics(
         response=modal_model.response,
-        pairs=np.concatenate([modal_poles, background_poles]),
-        names=(
+        pole_pairs=np.concatenate([modal_poles, background_poles]),
+        pair_names=(
             *(
                 f"mode_{mode_number}" if mode_number else f"resonance_{pole_number}"
                 for pole_number, mode_number in enumerate(mode_numbers, start=1)
             ),
             *(f"residual_{pole_number}" for pole_number in range(1, background_poles.size + 1)),
         ),
-        in_band=modal_poles.size,
+        pair_count_in_band=modal_poles.size,
         band_hz=band_hz,
     )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from analysis.linear_model._pole_fit import InputKind, PoleStructure
     from analysis.linear_model._state_space import StateSpace
 
-DEFAULT_SAMPLES: Final = 50
+DEFAULT_POSTERIOR_SAMPLES: Final = 50
 """Default number of samples of the posterior distribution of the parameters."""
 
 _RANDOM_SEED: Final = 0
@@ -31,10 +31,10 @@ _RANDOM_SEED: Final = 0
 _MAX_DRAWS_PER_SAMPLE: Final = 10
 """Largest number of random draws for each accepted sample."""
 
-_TABLE_POINTS: Final = 400
+_ACCURACY_TABLE_POINTS: Final = 400
 """Number of frequencies of the exported response, in addition to those of poles and zeros."""
 
-_STEP_STD: Final = 1e-3
+_DERIVATIVE_STEP_STDS: Final = 1e-3
 """Step of the numerical derivatives, in standard deviations of the parameters."""
 
 
@@ -46,21 +46,21 @@ class ModelOptions:
     ----------
     beam : bool
         Whether to export the beam's model even if a uniform beam does not predict the modes.
-    given : str
+    input_kind : str
         Input: "acceleration", or "angle" for angle, velocity and acceleration.
     order : int or None
         Number of states. None for the fewest that reach `MAX_RELATIVE_ERROR`.
     rate_hz : float or None
         Sampling rate of the model, whose input is held between samples. None for continuous time.
-    samples : int
+    posterior_sample_count : int
         Number of samples of the posterior distribution.
     """
 
     beam: bool = False
-    given: InputKind = "acceleration"
+    input_kind: InputKind = "acceleration"
     order: int | None = None
     rate_hz: float | None = None
-    samples: int = DEFAULT_SAMPLES
+    posterior_sample_count: int = DEFAULT_POSTERIOR_SAMPLES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,13 +69,13 @@ class PosteriorSamples:
 
     Attributes
     ----------
-    parameters : ndarray, shape (samples, k)
+    parameter_samples : ndarray, shape (samples, k)
         Sampled parameters.
     systems : tuple of StateSpace
         State space of each sample. All have the same states.
     """
 
-    parameters: NDArray[np.float64]
+    parameter_samples: NDArray[np.float64]
     systems: tuple[StateSpace, ...]
 
 
@@ -93,35 +93,35 @@ class Accuracy:
         Logarithmically spaced frequencies, and those of the poles and zeros of the response.
     response : ndarray of complex, shape (m,)
         Exact response with filters and delay, coupling torque over motor angle in N·m/rad.
-    error : ndarray, shape (m,)
+    relative_error : ndarray, shape (m,)
         Relative error of the realisation.
-    std : ndarray, shape (m,)
+    relative_std : ndarray, shape (m,)
         Relative standard deviation of the response. NaN if no covariance is stated.
-    error_max : float
+    max_relative_error : float
         Largest relative error at frequencies several times denser than `frequency_hz`.
     """
 
     band_hz: tuple[float, float]
     frequency_hz: NDArray[np.float64]
     response: NDArray[np.complex128]
-    error: NDArray[np.float64]
-    std: NDArray[np.float64]
-    error_max: float
+    relative_error: NDArray[np.float64]
+    relative_std: NDArray[np.float64]
+    max_relative_error: float
 
     @property
-    def error_median(self) -> float:
+    def median_relative_error(self) -> float:
         """Return the relative error of the state space as a median over the frequencies."""
-        return float(np.median(self.error))
+        return float(np.median(self.relative_error))
 
     @property
-    def std_max(self) -> float:
+    def max_relative_std(self) -> float:
         """Return the largest relative standard deviation of the response, NaN if unknown."""
-        return float(self.std.max())
+        return float(self.relative_std.max())
 
     @property
-    def std_median(self) -> float:
+    def median_relative_std(self) -> float:
         """Return the median relative standard deviation of the response, NaN if unknown."""
-        return float(np.median(self.std))
+        return float(np.median(self.relative_std))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +134,7 @@ class LinearModel:
         Models of the analysis.
     kind : str
         Realised model: "beam" or "modal".
-    uncertain : UncertainDynamics
+    uncertain_dynamics : UncertainDynamics
         Dynamics of this model as a function of its parameters.
     options : ModelOptions
         Options of the export.
@@ -150,7 +150,7 @@ class LinearModel:
 
     identified: IdentifiedModel
     kind: Literal["beam", "modal"]
-    uncertain: UncertainDynamics
+    uncertain_dynamics: UncertainDynamics
     options: ModelOptions
     system: StateSpace
     structure: PoleStructure
@@ -179,7 +179,7 @@ class LinearModel:
         modal_model = self.identified.modal
         modal_names_and_covariance = self.identified.modal_covariance()
         modal_names, modal_covariance = modal_names_and_covariance or ((), np.zeros((0, 0)))
-        test = self.identified.uniform_beam_test
+        uniform_beam_test = self.identified.uniform_beam_test
         n, (p, m) = state_space.order, state_space.d.shape
         stacked_matrices = {
             matrix_name: np.array(
@@ -200,8 +200,10 @@ class LinearModel:
             "format_version": 1,
             "source": self.identified.source,
             "model": self.kind,
-            "uniform_beam_status": test.status,
-            "uniform_beam_p_value": np.nan if test.p_value is None else test.p_value,
+            "uniform_beam_status": uniform_beam_test.status,
+            "uniform_beam_p_value": np.nan
+            if uniform_beam_test.p_value is None
+            else uniform_beam_test.p_value,
             "notes": list(self.notes),
             "order": n,
             "A": state_space.a,
@@ -219,16 +221,16 @@ class LinearModel:
             "band_hz": np.array(model_accuracy.band_hz),
             "frequency_hz": model_accuracy.frequency_hz,
             "response_nm_per_rad": model_accuracy.response,
-            "error": model_accuracy.error,
-            "error_max": model_accuracy.error_max,
-            "error_median": model_accuracy.error_median,
-            "uncertainty": model_accuracy.std,
-            "uncertainty_max": model_accuracy.std_max,
-            "uncertainty_median": model_accuracy.std_median,
-            "parameter_names": list(self.uncertain.names),
-            "parameter_values": self.uncertain.values,
-            "parameter_covariance": self.uncertain.covariance,
-            "parameter_samples": posterior_samples.parameters,
+            "error": model_accuracy.relative_error,
+            "error_max": model_accuracy.max_relative_error,
+            "error_median": model_accuracy.median_relative_error,
+            "uncertainty": model_accuracy.relative_std,
+            "uncertainty_max": model_accuracy.max_relative_std,
+            "uncertainty_median": model_accuracy.median_relative_std,
+            "parameter_names": list(self.uncertain_dynamics.parameter_names),
+            "parameter_values": self.uncertain_dynamics.parameter_values,
+            "parameter_covariance": self.uncertain_dynamics.covariance,
+            "parameter_samples": posterior_samples.parameter_samples,
             **{
                 f"{matrix_name}_samples": value_list
                 for matrix_name, value_list in stacked_matrices.items()
@@ -273,26 +275,26 @@ def linear_model(
     """
     export_beam = options.beam or identified.uniform_beam_test.status == PASSED_STATUS
     uncertain_dynamics = identified.beam() if export_beam else identified.modes()
-    if options.samples and not uncertain_dynamics.names:
-        key = "covariance" if export_beam else "modal_model.covariance"
+    if options.posterior_sample_count and not uncertain_dynamics.parameter_names:
+        covariance_key = "covariance" if export_beam else "modal_model.covariance"
         raise LinearModelError(
-            f"{identified.headline_name} has no {key}, as of an older version or of a campaign, "
-            "so no "
+            f"{identified.headline_name} has no {covariance_key}, as of an older version or of a "
+            "campaign, so no "
             "samples can be drawn; analyze a session again, or add --samples 0."
         )
     on_step("order")
-    nominal_dynamics = uncertain_dynamics.nominal
+    nominal_dynamics = uncertain_dynamics.nominal_dynamics
     fit = PoleFit(nominal_dynamics)
-    pole_structure, state_space = realise_response(fit, options.order, options.given)
+    pole_structure, state_space = realise_response(fit, options.order, options.input_kind)
     on_step("accuracy")
     model_accuracy = _accuracy(uncertain_dynamics, fit, state_space)
     on_step("samples")
     posterior_samples = _draw_posterior(uncertain_dynamics, fit, pole_structure, options)
     if options.rate_hz is not None:
         rate_hz = options.rate_hz
-        state_space = state_space.sampled(rate_hz)
+        state_space = state_space.discretized(rate_hz)
         sampled_systems = tuple(
-            sample_system.sampled(rate_hz) for sample_system in posterior_samples.systems
+            sample_system.discretized(rate_hz) for sample_system in posterior_samples.systems
         )
         posterior_samples = replace(posterior_samples, systems=sampled_systems)
     return LinearModel(
@@ -312,20 +314,24 @@ def _accuracy(
 ) -> Accuracy:
     """Return the relative error of a state space and the relative uncertainty of the response."""
     low_hz, high_hz = fit.dynamics.band_hz
-    pole_and_zero_hz = np.concatenate([fit.dynamics.pairs, fit.zeros]).imag / (2 * np.pi)
-    hz_in_band = pole_and_zero_hz[(pole_and_zero_hz > low_hz) & (pole_and_zero_hz < high_hz)]
+    pole_and_zero_hz = np.concatenate([fit.dynamics.pole_pairs, fit.zeros]).imag / (2 * np.pi)
+    pole_and_zero_in_band_hz = pole_and_zero_hz[
+        (pole_and_zero_hz > low_hz) & (pole_and_zero_hz < high_hz)
+    ]
     frequency_hz = np.sort(
-        np.concatenate([np.geomspace(low_hz, high_hz, _TABLE_POINTS), hz_in_band])
+        np.concatenate(
+            [np.geomspace(low_hz, high_hz, _ACCURACY_TABLE_POINTS), pole_and_zero_in_band_hz]
+        )
     )
     s = imaginary_axis(frequency_hz)
-    exact_response = fit.dynamics.filtered(s)
+    exact_response = fit.dynamics.filtered_response(s)
     return Accuracy(
         fit.dynamics.band_hz,
         frequency_hz,
         exact_response * np.exp(-fit.dynamics.delay_s * s),
         np.abs(angle_response(state_space, s) / exact_response - 1),
         _relative_std(uncertain_dynamics, s),
-        float(fit.error(state_space).max()),
+        float(fit.relative_error(state_space).max()),
     )
 
 
@@ -336,28 +342,30 @@ def _relative_std(
 
     It follows from the covariance of the parameters to first order; it is NaN if there is none.
     """
-    if not uncertain_dynamics.names:
+    if not uncertain_dynamics.parameter_names:
         return np.full(s.size, np.nan)
 
     def response(parameter_values: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the exact torque response in N·m/rad, with filters and delay, at the points s."""
         sampled_dynamics = uncertain_dynamics.dynamics_of(
-            uncertain_dynamics.by_name(parameter_values)
+            uncertain_dynamics.parameters_by_name(parameter_values)
         )
-        return sampled_dynamics.filtered(s) * np.exp(-sampled_dynamics.delay_s * s)
+        return sampled_dynamics.filtered_response(s) * np.exp(-sampled_dynamics.delay_s * s)
 
     variances, eigenvectors = np.linalg.eigh(uncertain_dynamics.covariance)
     total_variance = np.zeros(s.size)
     for variance, eigenvector in zip(variances, eigenvectors.T, strict=True):
         if variance > 0:
-            parameter_step = np.sqrt(variance) * _STEP_STD * eigenvector
+            parameter_step = np.sqrt(variance) * _DERIVATIVE_STEP_STDS * eigenvector
             upper_response, lower_response = (
-                response(uncertain_dynamics.values + parameter_step),
-                response(uncertain_dynamics.values - parameter_step),
+                response(uncertain_dynamics.parameter_values + parameter_step),
+                response(uncertain_dynamics.parameter_values - parameter_step),
             )
-            total_variance += np.abs((upper_response - lower_response) / (2 * _STEP_STD)) ** 2
+            total_variance += (
+                np.abs((upper_response - lower_response) / (2 * _DERIVATIVE_STEP_STDS)) ** 2
+            )
     relative_std: NDArray[np.float64] = np.sqrt(total_variance) / np.abs(
-        response(uncertain_dynamics.values)
+        response(uncertain_dynamics.parameter_values)
     )
     return relative_std
 
@@ -373,7 +381,7 @@ def _draw_posterior(
     Samples whose model needs other states than the nominal one are rejected. Raise
     `LinearModelError` if too few remain.
     """
-    requested_count = options.samples
+    requested_count = options.posterior_sample_count
     accepted_values: list[NDArray[np.float64]] = []
     sample_systems: list[StateSpace] = []
     random_generator = np.random.default_rng(_RANDOM_SEED)
@@ -381,12 +389,12 @@ def _draw_posterior(
         if len(accepted_values) == requested_count:
             break
         drawn_values = random_generator.multivariate_normal(
-            uncertain_dynamics.values,
+            uncertain_dynamics.parameter_values,
             uncertain_dynamics.covariance,
             method="eigh",
             check_valid="ignore",
         )
-        sampled_dynamics = _dynamics_of_sample(
+        sampled_dynamics = _dynamics_with_same_poles(
             uncertain_dynamics, drawn_values, fit.dynamics, pole_structure
         )
         if sampled_dynamics is None:
@@ -396,7 +404,7 @@ def _draw_posterior(
         if sampled_fit.is_stable_on_motor(pole_structure, fit_coefficients):
             accepted_values.append(drawn_values)
             sample_systems.append(
-                sampled_fit.system(pole_structure, fit_coefficients, options.given)
+                sampled_fit.system(pole_structure, fit_coefficients, options.input_kind)
             )
     if len(accepted_values) < requested_count:
         raise LinearModelError(
@@ -405,12 +413,14 @@ def _draw_posterior(
             "--samples 0."
         )
     return PosteriorSamples(
-        np.array(accepted_values).reshape(requested_count, uncertain_dynamics.values.size),
+        np.array(accepted_values).reshape(
+            requested_count, uncertain_dynamics.parameter_values.size
+        ),
         tuple(sample_systems),
     )
 
 
-def _dynamics_of_sample(
+def _dynamics_with_same_poles(
     uncertain_dynamics: UncertainDynamics,
     sampled_values: NDArray[np.float64],
     nominal_dynamics: Dynamics,
@@ -420,17 +430,19 @@ def _dynamics_of_sample(
 
     Return None if the parameters are impossible or their model needs other states.
     """
-    parameter_values = uncertain_dynamics.by_name(sampled_values)
+    parameter_values = uncertain_dynamics.parameters_by_name(sampled_values)
     if not uncertain_dynamics.is_possible(parameter_values):
         return None
     try:
         sampled_dynamics = uncertain_dynamics.dynamics_of(parameter_values)
     except LinearModelError:
         return None
-    has_same_poles = sampled_dynamics.names[: pole_structure.pairs] == nominal_dynamics.names[
-        : pole_structure.pairs
-    ] and len(sampled_dynamics.real_poles) == len(nominal_dynamics.real_poles)
-    has_same_filters = [filter_entry[1] for filter_entry in sampled_dynamics.filters] == [
-        filter_entry[1] for filter_entry in nominal_dynamics.filters
+    has_same_poles = sampled_dynamics.pair_names[
+        : pole_structure.pair_count
+    ] == nominal_dynamics.pair_names[: pole_structure.pair_count] and len(
+        sampled_dynamics.real_poles
+    ) == len(nominal_dynamics.real_poles)
+    has_same_filters = [torque_filter[1] for torque_filter in sampled_dynamics.torque_filters] == [
+        torque_filter[1] for torque_filter in nominal_dynamics.torque_filters
     ]
     return sampled_dynamics if has_same_poles and has_same_filters else None

@@ -40,13 +40,13 @@ _ANALYZE_AGAIN_ADVICE: Final = "analyze the session again"
 _LOGARITHM_PREFIX: Final = "ln_"
 """Prefix of a parameter's name in a covariance if this is the covariance of its logarithm."""
 
-_MAX_OFFSET_MODE: Final = 50
+_MAX_OFFSET_MODE_NUMBER: Final = 50
 """Largest number of a mode for which a document may state a stiffness offset."""
 
 _MAX_MODES: Final = 40
 """Largest number of modes in a modal model."""
 
-_REASONS_TO_LEAVE_OUT: Final = {
+_OMISSION_REASONS_BY_PARAMETER: Final = {
     "drag": "the drag of the air grows with the amplitude",
     "clock_rate_difference": "it is a property of the instruments",
 }
@@ -56,7 +56,7 @@ compliance of the clamp."""
 _DEFAULT_BAND_HZ: Final = (0.05, 50.0)
 """Band in hertz of an analysis whose document does not state the band."""
 
-_MIN_FIRST_HZ: Final = 0.05
+_MIN_BAND_START_HZ: Final = 0.05
 """Lowest first frequency of a band, in hertz."""
 
 PASSED_STATUS: Final = "passed"
@@ -101,19 +101,19 @@ class IdentifiedModel:
         try:
             modal_model = ModalModel.from_json(model_entry)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise self._error("modal_model", "is not a modal model") from error
-        model_numbers = [*modal_model.poles_rad_s, *modal_model.residues, *modal_model.background]
+            raise self._headline_error("modal_model", "is not a modal model") from error
+        modal_numbers = [*modal_model.poles_rad_s, *modal_model.residues, *modal_model.background]
         is_stable = all(pole.real < 0 < pole.imag for pole in modal_model.poles_rad_s)
         if len(modal_model.background) != BACKGROUND_COEFFICIENTS or not (
             len(modal_model.poles_rad_s) == len(modal_model.residues) <= _MAX_MODES
         ):
-            raise self._error(
+            raise self._headline_error(
                 "modal_model",
                 f"must have up to {_MAX_MODES} poles, a residue for each of them, and "
                 f"{BACKGROUND_COEFFICIENTS} coefficients of the background",
             )
-        if not is_stable or not all(map(_is_finite, model_numbers)):
-            raise self._error(
+        if not is_stable or not all(map(_is_finite, modal_numbers)):
+            raise self._headline_error(
                 "modal_model", "must have poles with negative real and positive imaginary parts"
             )
         return modal_model
@@ -136,7 +136,7 @@ class IdentifiedModel:
         )
         note_texts += [
             f"{parameter_name} is not part of the model: {why}"
-            for parameter_name, why in _REASONS_TO_LEAVE_OUT.items()
+            for parameter_name, why in _OMISSION_REASONS_BY_PARAMETER.items()
             if parameter_name in estimates and estimates[parameter_name].value
         ]
         effect_entries = self.headline.get("named")
@@ -191,9 +191,11 @@ class IdentifiedModel:
             if parameter_name not in beam_values or (
                 parameter_name != key_name and beam_values[parameter_name] <= 0
             ):
-                raise self._error("covariance.names", f"{key_name!r} has no such parameter")
+                raise self._headline_error(
+                    "covariance.names", f"{key_name!r} has no such parameter"
+                )
 
-        def all_values(determined_values: Mapping[str, float]) -> Mapping[str, float]:
+        def complete_beam_values(determined_values: Mapping[str, float]) -> Mapping[str, float]:
             """Return all beam parameters by name, some of them replaced by `determined_values`.
 
             A value whose name begins with "ln_" is a logarithm, and is converted.
@@ -207,7 +209,7 @@ class IdentifiedModel:
 
         return UncertainDynamics(
             lambda parameters: beam_dynamics(
-                _plant_of_parameters(all_values(parameters), length_m)
+                _plant_of_parameters(complete_beam_values(parameters), length_m)
             ),
             determined_names,
             np.array(
@@ -219,7 +221,7 @@ class IdentifiedModel:
                 ]
             ),
             covariance,
-            lambda parameters: _is_possible_beam(all_values(parameters)),
+            lambda parameters: _is_possible_beam(complete_beam_values(parameters)),
         )
 
     def modes(self) -> UncertainDynamics:
@@ -240,15 +242,15 @@ class IdentifiedModel:
         constant_values = [
             constant_value(modal_fit, constant_name) for constant_name in constant_names
         ]
-        present_values = [
+        known_constant_values = [
             nominal_value for nominal_value in constant_values if nominal_value is not None
         ]
-        if len(present_values) < len(constant_names):
-            raise self._error(
+        if len(known_constant_values) < len(constant_names):
+            raise self._headline_error(
                 "modal_model.names",
                 f"{constant_names[constant_values.index(None)]!r} has no such constant",
             )
-        nominal_constants = dict(zip(constant_names, present_values, strict=True))
+        nominal_constants = dict(zip(constant_names, known_constant_values, strict=True))
         stated_mode_numbers = self.headline["modal_model"].get("modes")
         numbers_are_stated = (
             isinstance(stated_mode_numbers, list) and len(stated_mode_numbers) == mode_count
@@ -268,7 +270,7 @@ class IdentifiedModel:
         return UncertainDynamics(
             lambda parameters: modal_dynamics(modal_model_of(parameters), band_hz, mode_numbers),
             constant_names,
-            np.array(present_values),
+            np.array(known_constant_values),
             covariance,
             lambda parameters: all(
                 pole.real < 0 < pole.imag for pole in modal_model_of(parameters).poles_rad_s
@@ -291,9 +293,11 @@ class IdentifiedModel:
                 len(stated_names), len(stated_names)
             )
         except (TypeError, ValueError, OverflowError) as error:
-            raise self._error(f"{entry_key}.{matrix_key}", "must be a square matrix") from error
+            raise self._headline_error(
+                f"{entry_key}.{matrix_key}", "must be a square matrix"
+            ) from error
         if len(set(map(str, stated_names))) < len(stated_names):
-            raise self._error(f"{entry_key}.names", "must be different from each other")
+            raise self._headline_error(f"{entry_key}.names", "must be different from each other")
         parameter_stds = np.sqrt(np.abs(np.diag(covariance)))
         scaled_covariance = covariance / np.outer(
             parameter_stds + (parameter_stds == 0), parameter_stds + (parameter_stds == 0)
@@ -302,10 +306,10 @@ class IdentifiedModel:
             len(stated_names)
             and np.linalg.eigvalsh((scaled_covariance + scaled_covariance.T) / 2).min() < -1e-6
         ):
-            raise self._error(f"{entry_key}.{matrix_key}", "must be positive semidefinite")
+            raise self._headline_error(f"{entry_key}.{matrix_key}", "must be positive semidefinite")
         return tuple(map(str, stated_names)), (covariance + covariance.T) / 2
 
-    def _error(self, headline_key: str, entry_problem: str) -> LinearModelError:
+    def _headline_error(self, headline_key: str, entry_problem: str) -> LinearModelError:
         """Return the exception that states why a key of the reported numbers cannot be used."""
         return LinearModelError(
             f"{self.headline_name}.{headline_key}: {entry_problem}; {_ANALYZE_AGAIN_ADVICE}."
@@ -337,7 +341,7 @@ def read_identified_model(path: Path) -> IdentifiedModel:
             "together; analyze one of them, or several as a campaign."
         )
 
-    def entries(list_key: str) -> list[dict[str, Any]]:
+    def list_entries(list_key: str) -> list[dict[str, Any]]:
         """Return the entries of a list in the document that belong to the file of the headline."""
         stated_list = document.get(list_key)
         entry_dicts = (
@@ -352,16 +356,17 @@ def read_identified_model(path: Path) -> IdentifiedModel:
         ]
 
     lengths_m = {
-        finite_number(document_entry.get("beam_length_m")) for document_entry in entries("files")
+        finite_number(document_entry.get("beam_length_m"))
+        for document_entry in list_entries("files")
     }
     (length_m,) = lengths_m if len(lengths_m) == 1 else (None,)
-    stated_bands = [document_entry.get("band_hz") for document_entry in entries("records")]
+    stated_bands = [document_entry.get("band_hz") for document_entry in list_entries("records")]
     return IdentifiedModel(
         path.name,
         headline_name,
         headline,
         length_m if length_m and length_m > 0 and is_usable_size(length_m) else None,
-        _band_hz(stated_bands[0] if stated_bands else None),
+        _usable_band_hz(stated_bands[0] if stated_bands else None),
     )
 
 
@@ -391,11 +396,11 @@ def identify_session(path: Path) -> IdentifiedModel:
         str(path),
         headline_json,
         record.beam.length_m,
-        _band_hz(list(record_analysis.band_hz)),
+        _usable_band_hz(list(record_analysis.band_hz)),
     )
 
 
-def _band_hz(stated_band: object) -> tuple[float, float]:
+def _usable_band_hz(stated_band: object) -> tuple[float, float]:
     """Return the first and last frequency of a stated band, in hertz.
 
     Return the default band if the stated one cannot be used.
@@ -406,9 +411,9 @@ def _band_hz(stated_band: object) -> tuple[float, float]:
             low_hz is not None
             and high_hz is not None
             and 0 <= low_hz < high_hz
-            and high_hz > _MIN_FIRST_HZ
+            and high_hz > _MIN_BAND_START_HZ
         ):
-            return max(low_hz, _MIN_FIRST_HZ), high_hz
+            return max(low_hz, _MIN_BAND_START_HZ), high_hz
     return _DEFAULT_BAND_HZ
 
 
@@ -420,7 +425,7 @@ def _is_finite(complex_number: complex) -> bool:
 def _is_possible_beam(sampled_values: Mapping[str, float]) -> bool:
     """Return whether sampled parameters describe a physically possible beam."""
     return all(
-        parameter_name in _REASONS_TO_LEAVE_OUT
+        parameter_name in _OMISSION_REASONS_BY_PARAMETER
         or parameter_named(parameter_name).is_valid(parameter_value)
         for parameter_name, parameter_value in sampled_values.items()
     )
@@ -436,7 +441,7 @@ def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> P
         ),
         default=1,
     )
-    if last_offset_mode > _MAX_OFFSET_MODE:
+    if last_offset_mode > _MAX_OFFSET_MODE_NUMBER:
         raise LinearModelError(
             f"{OFFSET_PREFIX}{last_offset_mode} is of a mode beyond the band; "
             f"{_ANALYZE_AGAIN_ADVICE}."
@@ -444,7 +449,7 @@ def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> P
     plant_values = {
         parameter_name: parameter_value
         for parameter_name, parameter_value in beam_values.items()
-        if parameter_name not in _REASONS_TO_LEAVE_OUT
+        if parameter_name not in _OMISSION_REASONS_BY_PARAMETER
     }
     try:
         return Plant.from_parameters(length_m, plant_values)

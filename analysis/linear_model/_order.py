@@ -44,10 +44,10 @@ def realise_response(
     dynamics = fit.dynamics
     if order is not None:
         min_states = len(dynamics.real_poles) + sum(
-            filter_order for _, filter_order in dynamics.filters
+            filter_order for _, filter_order in dynamics.torque_filters
         )
-        max_states = min_states + 2 * len(dynamics.pairs) + _MAX_REAL_POLES
-        zero_real_poles = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
+        max_states = min_states + 2 * len(dynamics.pole_pairs) + _MAX_REAL_POLES
+        zero_real_poles = dict.fromkeys(range(len(dynamics.pole_pairs) + 1), 0)
         realisation = _best_realisation(
             fit, order - min_states, input_kind, zero_real_poles, np.inf
         )
@@ -55,14 +55,15 @@ def realise_response(
             return realisation
         raise LinearModelError(
             f"A stable model with {order} states was not found: the model may have "
-            f"{min_states} to {max_states} states, 2 for each of the {dynamics.in_band} modes "
+            f"{min_states} to {max_states} states, 2 for each of the "
+            f"{dynamics.pair_count_in_band} modes "
             "in its band; state another number, or --order auto."
         )
     min_real_poles = {
         pair_count: bisect_left(
             range(_MAX_REAL_POLES + 1), True, key=partial(_real_poles_suffice, fit, pair_count)
         )
-        for pair_count in range(dynamics.in_band, len(dynamics.pairs) + 1)
+        for pair_count in range(dynamics.pair_count_in_band, len(dynamics.pole_pairs) + 1)
     }
     min_real_poles = {
         pair_count: real_pole_count
@@ -167,7 +168,9 @@ def _best_realisation(
         accurate_fits, key=lambda accurate_fit: accurate_fit[:2]
     ):
         state_space = fit.system(pole_structure, fit_coefficients, input_kind)
-        is_accurate = error_tolerance == np.inf or fit.error(state_space).max() <= error_tolerance
+        is_accurate = (
+            error_tolerance == np.inf or fit.relative_error(state_space).max() <= error_tolerance
+        )
         if is_accurate and fit.is_stable_on_motor(pole_structure, fit_coefficients):
             return pole_structure, state_space
     return None

@@ -41,17 +41,17 @@ _INPUT_SIGNALS: Final = SignalNames(
 _OUTPUT_SIGNAL: Final = SignalNames(("coupling_torque",), ("N.m",))
 """Name and unit of the output."""
 
-_FIT_POINTS: Final = (200, 10)
+_FIT_POINT_COUNTS: Final = (200, 10)
 """Numbers of frequencies to which a state space is fitted: over the band, and around each pole and
 zero."""
 
-_CHECK_POINTS: Final = (1200, 34)
+_CHECK_POINT_COUNTS: Final = (1200, 34)
 """Numbers of frequencies at which the error of a fit is checked: over the band, and around each
 pole and zero."""
 _BAND_MARGIN_FACTOR: Final = 1.1
 """Factor by which the range of frequencies with full weight exceeds the band at each end."""
 
-_TAIL_FACTORS: Final = (500.0, 10.0)
+_TAIL_FREQUENCY_FACTORS: Final = (500.0, 10.0)
 """Factors by which the range of frequencies with little weight exceeds the band, below and above.
 """
 _TAIL_POINTS: Final = 25
@@ -60,15 +60,15 @@ _TAIL_POINTS: Final = 25
 _TAIL_WEIGHT: Final = 1e-5
 """Weight of the relative error at frequencies outside of the band."""
 
-_MIN_RELATIVE_DISTANCE: Final = 3e-7
+_MIN_RELATIVE_POLE_DISTANCE: Final = 3e-7
 """Smallest distance from a pole or zero, relative to the frequency, for a meaningful error."""
-_SCAN_POINTS: Final = 4000
+_ZERO_SCAN_POINTS: Final = 4000
 """Number of frequencies at which minima of the response are searched for."""
 
 _MAX_NEWTON_ITERATIONS: Final = 30
 """Largest number of Newton iterations for the zeros."""
 
-_SINGULAR_VALUE_LIMIT: Final = 1e-10
+_RELATIVE_SINGULAR_VALUE_LIMIT: Final = 1e-10
 """Singular values below this fraction of the largest one count as zero in the least squares."""
 
 _MAX_RELATIVE_ZERO_CHANGE: Final = 0.3
@@ -83,17 +83,17 @@ class PoleStructure:
 
     Attributes
     ----------
-    pairs : int
+    pair_count : int
         Number of conjugate pairs of poles.
     added_real_poles_rad_s : tuple of float
         Negative real poles in addition to those of over-damped modes.
-    integrators : int
+    integrator_count : int
         Number of integrals of the acceleration: 0, 1 (velocity) or 2 (velocity and angle).
     """
 
-    pairs: int
+    pair_count: int
     added_real_poles_rad_s: tuple[float, ...]
-    integrators: int
+    integrator_count: int
 
 
 class PoleFit:
@@ -108,37 +108,41 @@ class PoleFit:
         start_zeros = self._response_minima() if similar_fit is None else similar_fit.zeros
         self.zeros: NDArray[np.complex128] = self._find_zeros(start_zeros)
         wide_band_hz = (low_hz / _BAND_MARGIN_FACTOR, high_hz * _BAND_MARGIN_FACTOR)
-        frequencies_in_band_hz = self._dense_frequencies(wide_band_hz, _FIT_POINTS)
-        tail_hz = np.concatenate(
+        band_frequency_hz = self._dense_frequencies(wide_band_hz, _FIT_POINT_COUNTS)
+        tail_frequency_hz = np.concatenate(
             [
-                np.geomspace(low_hz / _TAIL_FACTORS[0], wide_band_hz[0], _TAIL_POINTS),
-                np.geomspace(wide_band_hz[1], high_hz * _TAIL_FACTORS[1], _TAIL_POINTS),
+                np.geomspace(low_hz / _TAIL_FREQUENCY_FACTORS[0], wide_band_hz[0], _TAIL_POINTS),
+                np.geomspace(wide_band_hz[1], high_hz * _TAIL_FREQUENCY_FACTORS[1], _TAIL_POINTS),
             ]
         )
         if dynamics.motor_inertia_kg_m2 is None:  # a modal model is meant for its band alone
-            tail_hz = tail_hz[:0]
-        frequency_hz = np.concatenate([frequencies_in_band_hz, tail_hz])
+            tail_frequency_hz = tail_frequency_hz[:0]
+        frequency_hz = np.concatenate([band_frequency_hz, tail_frequency_hz])
         is_usable = self._is_apart_from_poles_and_zeros(frequency_hz)
         self._s = imaginary_axis(frequency_hz[is_usable])
-        self._in_band = (np.arange(frequency_hz.size) < frequencies_in_band_hz.size)[is_usable]
+        self._in_band = (np.arange(frequency_hz.size) < band_frequency_hz.size)[is_usable]
         point_weight = np.where(self._in_band, 1.0, _TAIL_WEIGHT)
         torque_per_acceleration = dynamics.response(self._s) / self._s**2
-        self._scale = point_weight / np.abs(torque_per_acceleration)
-        self._target = (torque_per_acceleration - dynamics.tool_inertia_kg_m2) * self._scale
-        self._pair_basis = [self._pair_basis_functions(upper_pole) for upper_pole in dynamics.pairs]
+        self._point_scale = point_weight / np.abs(torque_per_acceleration)
+        self._weighted_target_response = (
+            torque_per_acceleration - dynamics.tool_inertia_kg_m2
+        ) * self._point_scale
+        self._pair_basis = [
+            self._pair_basis_functions(upper_pole) for upper_pole in dynamics.pole_pairs
+        ]
 
     @cached_property
     def check_points_s(self) -> NDArray[np.complex128]:
         """Return the points s in rad/s at which the error of a fitted state space is checked."""
-        check_frequency_hz = self._dense_frequencies(self.dynamics.band_hz, _CHECK_POINTS)
+        check_frequency_hz = self._dense_frequencies(self.dynamics.band_hz, _CHECK_POINT_COUNTS)
         return imaginary_axis(
             check_frequency_hz[self._is_apart_from_poles_and_zeros(check_frequency_hz)]
         )
 
     @cached_property
-    def exact(self) -> NDArray[np.complex128]:
+    def exact_response(self) -> NDArray[np.complex128]:
         """Return the exact response at `check_points_s`, without delay, in N·m/rad."""
-        return self.dynamics.filtered(self.check_points_s)
+        return self.dynamics.filtered_response(self.check_points_s)
 
     def real_poles(self, pole_structure: PoleStructure) -> tuple[float, ...]:
         """Return all real poles of a pole structure in rad/s, those of over-damped modes first."""
@@ -151,19 +155,23 @@ class PoleFit:
         integrators), and the largest relative error in the band, at the points of the fit.
         """
         real_poles = self.real_poles(pole_structure)
-        direct_term_count = 1 + pole_structure.integrators
+        direct_term_count = 1 + pole_structure.integrator_count
         basis_functions = np.concatenate(
             [
-                *self._pair_basis[: pole_structure.pairs],
+                *self._pair_basis[: pole_structure.pair_count],
                 [1 / (self._s - real_pole) for real_pole in real_poles]
                 or np.empty((0, self._s.size)),
                 [self._s**-power_of_s for power_of_s in range(direct_term_count)],
             ]
         )
-        basis_functions = basis_functions * self._scale
-        bounded_count = direct_term_count if self.dynamics.motor_inertia_kg_m2 is not None else 0
-        fit_coefficients = _least_squares(basis_functions, self._target, bounded_count)
-        weighted_residual = fit_coefficients @ basis_functions - self._target
+        basis_functions = basis_functions * self._point_scale
+        bounded_coefficient_count = (
+            direct_term_count if self.dynamics.motor_inertia_kg_m2 is not None else 0
+        )
+        fit_coefficients = _least_squares(
+            basis_functions, self._weighted_target_response, bounded_coefficient_count
+        )
+        weighted_residual = fit_coefficients @ basis_functions - self._weighted_target_response
         return fit_coefficients, float(np.abs(weighted_residual[self._in_band]).max())
 
     def system(
@@ -178,16 +186,16 @@ class PoleFit:
         velocity and acceleration.
         """
         state_space = self._system_without_filters(pole_structure, fit_coefficients, input_kind)
-        for time_constant_s, filter_order in self.dynamics.filters:
+        for time_constant_s, filter_order in self.dynamics.torque_filters:
             state_space = with_filter(state_space, time_constant_s, filter_order)
         return replace(state_space, delay_s=self.dynamics.delay_s)
 
-    def error(self, state_space: StateSpace) -> NDArray[np.float64]:
+    def relative_error(self, state_space: StateSpace) -> NDArray[np.float64]:
         """Return the relative error of a state space at each point of `check_points_s`.
 
         The state space is a realisation in continuous time.
         """
-        return np.abs(angle_response(state_space, self.check_points_s) / self.exact - 1)
+        return np.abs(angle_response(state_space, self.check_points_s) / self.exact_response - 1)
 
     def is_stable_on_motor(
         self, pole_structure: PoleStructure, fit_coefficients: NDArray[np.float64]
@@ -215,7 +223,7 @@ class PoleFit:
     ) -> StateSpace:
         """Return the state space of a fit with tool inertia, without filters and delay."""
         upper_poles, real_poles = (
-            self.dynamics.pairs[: pole_structure.pairs],
+            self.dynamics.pole_pairs[: pole_structure.pair_count],
             self.real_poles(pole_structure),
         )
         pole_count = 2 * upper_poles.size + len(real_poles)
@@ -235,7 +243,7 @@ class PoleFit:
         inertia_coefficient += self.dynamics.tool_inertia_kg_m2
         state_names = [
             f"{mode_name}_{state_suffix}"
-            for mode_name in self.dynamics.names[: upper_poles.size]
+            for mode_name in self.dynamics.pair_names[: upper_poles.size]
             for state_suffix in "ab"
         ]
         state_names += [
@@ -255,7 +263,7 @@ class PoleFit:
                 SignalNames(tuple(state_names), ("rad.s",) * pole_count),
             )
         # Velocity v and angle q are integrals of the input u: v' = u, q' = v.
-        k = pole_structure.integrators
+        k = pole_structure.integrator_count
         a = np.pad(a, (0, k))
         if k == 2:
             a[pole_count + 1, pole_count] = 1.0
@@ -287,7 +295,7 @@ class PoleFit:
 
     def _poles_and_zeros(self) -> NDArray[np.complex128]:
         """Return the complex poles and zeros of the response to be fitted, in rad/s."""
-        return np.concatenate([self.dynamics.pairs, self.zeros])
+        return np.concatenate([self.dynamics.pole_pairs, self.zeros])
 
     def _dense_frequencies(
         self, band_hz: tuple[float, float], point_counts: tuple[int, int]
@@ -301,10 +309,12 @@ class PoleFit:
             np.abs(poles_and_zeros_rad_s.real), 1e-4 * np.abs(poles_and_zeros_rad_s)
         )
         relative_offsets = np.linspace(-3, 3, point_counts[1])
-        near_hz = (
+        near_poles_and_zeros_hz = (
             poles_and_zeros_rad_s.imag[:, None] + half_width_rad_s[:, None] * relative_offsets
         ).ravel() / (2 * np.pi)
-        frequencies_hz = np.concatenate([np.geomspace(*band_hz, point_counts[0]), near_hz])
+        frequencies_hz = np.concatenate(
+            [np.geomspace(*band_hz, point_counts[0]), near_poles_and_zeros_hz]
+        )
         return np.sort(
             frequencies_hz[(frequencies_hz >= band_hz[0]) & (frequencies_hz <= band_hz[1])]
         )
@@ -318,13 +328,15 @@ class PoleFit:
         distance_rad_s = np.abs(1j * omega_rad_s[:, None] - self._poles_and_zeros()).min(
             axis=1, initial=np.inf
         )
-        is_apart: NDArray[np.bool_] = distance_rad_s > _MIN_RELATIVE_DISTANCE * omega_rad_s
-        return is_apart
+        is_far_enough: NDArray[np.bool_] = (
+            distance_rad_s > _MIN_RELATIVE_POLE_DISTANCE * omega_rad_s
+        )
+        return is_far_enough
 
     def _response_minima(self) -> NDArray[np.complex128]:
         """Return the points s = j omega of the local minima of the torque per acceleration."""
         low_hz, high_hz = self.dynamics.band_hz
-        s = imaginary_axis(np.geomspace(low_hz / 2, high_hz * 2, _SCAN_POINTS))
+        s = imaginary_axis(np.geomspace(low_hz / 2, high_hz * 2, _ZERO_SCAN_POINTS))
         response_magnitude = np.abs(self.dynamics.response(s) / s**2)
         minimum_indices = (
             np.flatnonzero(
@@ -351,9 +363,11 @@ class PoleFit:
                 / np.where(response_above == response_below, 1.0, response_above - response_below)
             )
             s = s - newton_step
-            has_left = np.abs(s / start_points - 1) > _MAX_RELATIVE_ZERO_CHANGE
-            s[has_left] = start_points[has_left]
-            if (np.abs(newton_step)[~has_left] < 1e-9 * np.abs(s)[~has_left]).all():
+            has_left_start_point = np.abs(s / start_points - 1) > _MAX_RELATIVE_ZERO_CHANGE
+            s[has_left_start_point] = start_points[has_left_start_point]
+            if (
+                np.abs(newton_step)[~has_left_start_point] < 1e-9 * np.abs(s)[~has_left_start_point]
+            ).all():
                 break
         return s
 
@@ -379,22 +393,24 @@ def angle_response(state_space: StateSpace, s: NDArray[np.complex128]) -> NDArra
 def _least_squares(
     basis_functions: NDArray[np.complex128],
     target_response: NDArray[np.complex128],
-    bounded_count: int,
+    bounded_coefficient_count: int,
 ) -> NDArray[np.float64]:
     """Return real least-squares coefficients, the last `bounded_count` of them not negative."""
     real_matrix = np.concatenate([basis_functions.real, basis_functions.imag], axis=1).T
     real_target = np.concatenate([target_response.real, target_response.imag])
     column_norms = np.linalg.norm(real_matrix, axis=0)
     real_matrix = real_matrix / column_norms
-    used_columns = np.arange(column_norms.size)
-    first_bounded_index = column_norms.size - bounded_count
+    used_column_indices = np.arange(column_norms.size)
+    first_bounded_index = column_norms.size - bounded_coefficient_count
     while True:
         scaled_solution = np.zeros(column_norms.size)
-        scaled_solution[used_columns] = np.linalg.lstsq(
-            real_matrix[:, used_columns], real_target, rcond=_SINGULAR_VALUE_LIMIT
+        scaled_solution[used_column_indices] = np.linalg.lstsq(
+            real_matrix[:, used_column_indices], real_target, rcond=_RELATIVE_SINGULAR_VALUE_LIMIT
         )[0]
-        bounded_values = scaled_solution[first_bounded_index:]
-        if not (bounded_values < 0).any():
+        bounded_coefficients = scaled_solution[first_bounded_index:]
+        if not (bounded_coefficients < 0).any():
             coefficients: NDArray[np.float64] = scaled_solution / column_norms
             return coefficients
-        used_columns = used_columns[used_columns != first_bounded_index + np.argmin(bounded_values)]
+        used_column_indices = used_column_indices[
+            used_column_indices != first_bounded_index + np.argmin(bounded_coefficients)
+        ]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_POINTS_PER_BLOCK: Final = 256
+_FREQUENCIES_PER_BLOCK: Final = 256
 """Number of frequencies whose equations are solved together."""
 
 
@@ -66,17 +66,17 @@ class StateSpace:
         The points s are in rad/s, and none of them is a pole.
         """
         frequency_response = np.empty((s.size, *self.d.shape), dtype=np.complex128)
-        for first_point in range(0, s.size, _POINTS_PER_BLOCK):
-            point_range = s[first_point : first_point + _POINTS_PER_BLOCK, None, None]
+        for first_point in range(0, s.size, _FREQUENCIES_PER_BLOCK):
+            points_of_block = s[first_point : first_point + _FREQUENCIES_PER_BLOCK, None, None]
             resolvent = np.linalg.solve(
-                point_range * np.eye(self.order) - self.a, self.b[None] + 0j
+                points_of_block * np.eye(self.order) - self.a, self.b[None] + 0j
             )
-            frequency_response[first_point : first_point + _POINTS_PER_BLOCK] = (
+            frequency_response[first_point : first_point + _FREQUENCIES_PER_BLOCK] = (
                 self.c @ resolvent + self.d
             )
         return frequency_response
 
-    def sampled(self, rate_hz: float) -> StateSpace:
+    def discretized(self, rate_hz: float) -> StateSpace:
         """Return the discrete-time system, which is exact for inputs held between the samples."""
         from scipy.signal import cont2discrete
 
@@ -86,7 +86,7 @@ class StateSpace:
         return replace(self, a=a, b=b, c=c, d=d, period_s=float(period_s))
 
 
-def with_filter(state_space: StateSpace, time_constant_s: float, order: int) -> StateSpace:
+def with_filter(state_space: StateSpace, time_constant_s: float, filter_order: int) -> StateSpace:
     """Return the system with a low-pass filter (order 1, or Butterworth of order 2) at its output.
 
     The system is in continuous time and has one output. `time_constant_s` is the reciprocal of the
@@ -94,29 +94,29 @@ def with_filter(state_space: StateSpace, time_constant_s: float, order: int) -> 
     """
     n, m = state_space.b.shape
     cutoff_rad_s = 1.0 / time_constant_s
-    a = np.zeros((n + order, n + order))
-    b = np.zeros((n + order, m))
+    a = np.zeros((n + filter_order, n + filter_order))
+    b = np.zeros((n + filter_order, m))
     a[:n, :n], b[:n] = state_space.a, state_space.b
-    first_state, last_state = n, n + order - 1
+    first_state, last_state = n, n + filter_order - 1
     # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
     a[last_state, :n], b[last_state] = (
         cutoff_rad_s * state_space.c[0],
         cutoff_rad_s * state_space.d[0],
     )
     a[last_state, first_state] = -cutoff_rad_s
-    if order == 2:
+    if filter_order == 2:
         a[first_state, last_state] = cutoff_rad_s
         a[last_state, last_state] = -np.sqrt(2) * cutoff_rad_s
     output_unit = state_space.outputs.units[0]
-    state_names = ("filter_output", "filter_slope")[:order]
+    state_names = ("filter_output", "filter_slope")[:filter_order]
     return replace(
         state_space,
         a=a,
         b=b,
-        c=np.eye(1, n + order, n),
+        c=np.eye(1, n + filter_order, n),
         d=np.zeros_like(state_space.d),
         states=concatenate_names(
-            (state_space.states, SignalNames(state_names, (output_unit,) * order))
+            (state_space.states, SignalNames(state_names, (output_unit,) * filter_order))
         ),
     )
 

@@ -456,15 +456,18 @@ def test_session_is_analysed_for_the_export(simulated, identified, analyze, tmp_
 def test_beam_and_modal_model_agree_within_uncertainty(identified):
     found = identified
     assert found.uniform_beam_test.status == "passed"
-    beam = linear_model(found, ModelOptions(order=20, samples=0))
+    beam = linear_model(found, ModelOptions(order=20, posterior_sample_count=0))
     unreadable = found.headline | {"validity": {"uniform_beam": {"status": "refused"}}}
     with pytest.raises(IdentifiedBeamError, match=r"validity\.uniform_beam"):
-        linear_model(dataclasses.replace(found, headline=unreadable), ModelOptions(samples=0))
+        linear_model(
+            dataclasses.replace(found, headline=unreadable), ModelOptions(posterior_sample_count=0)
+        )
     refused = found.headline | {
         "validity": {"uniform_beam": {"status": "refused", "p_value": 1e-9}}
     }
     modal = linear_model(
-        dataclasses.replace(found, headline=refused), ModelOptions(order=14, samples=0)
+        dataclasses.replace(found, headline=refused),
+        ModelOptions(order=14, posterior_sample_count=0),
     )
     assert (beam.kind, modal.kind) == ("beam", "modal")
     assert modal.system.states.names[0] == "mode_1_a"
@@ -472,11 +475,11 @@ def test_beam_and_modal_model_agree_within_uncertainty(identified):
     inner = (by_modal.frequency_hz > 1.0) & (by_modal.frequency_hz < 45.0)
     frequency_hz = by_modal.frequency_hz[inner]
     difference = response(beam.variables(), frequency_hz) / by_modal.response[inner] - 1
-    assert np.sqrt(np.mean(np.abs(difference / by_modal.std[inner]) ** 2)) < 2.5
+    assert np.sqrt(np.mean(np.abs(difference / by_modal.relative_std[inner]) ** 2)) < 2.5
     # The modal model assumes less, so it knows less.
-    assert np.median(by_modal.std[inner]) > 1.5 * by_beam.std_median
+    assert np.median(by_modal.relative_std[inner]) > 1.5 * by_beam.median_relative_std
     at_mode = np.argmin(np.abs(frequency_hz - 16.0))
-    assert by_modal.std[inner][at_mode] < 0.1
+    assert by_modal.relative_std[inner][at_mode] < 0.1
 
 
 @pytest.mark.process
