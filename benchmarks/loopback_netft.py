@@ -18,7 +18,7 @@ def serve_page(box: SimulatedBox) -> Iterator[int]:
     class PageHandler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             try:
-                content = box.get(self.path).encode()
+                content = box.get_page(self.path).encode()
             except OSError:
                 self.send_error(404)
             else:

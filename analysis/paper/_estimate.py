@@ -160,11 +160,12 @@ def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
         raise FrequencyResponseError(
             f"{record.path}: the sweep has {sweep_samples} samples "
             f"({sweep_samples / record.rate_hz:g} s), "
-            f"fewer than one Welch segment of {segment_length}{_segment_remedy(sweep_samples)}"
+            "fewer than one Welch segment of "
+            f"{segment_length}{_segment_length_remedy(sweep_samples)}"
         )
 
 
-def _segment_remedy(sweep_samples: int) -> str:
+def _segment_length_remedy(sweep_samples: int) -> str:
     """Return the end of a sentence with options that suit a sweep of this many samples."""
     try:
         segment_length, overlap_samples = segment_lengths(
@@ -182,21 +183,21 @@ def estimate_warnings(
     record: Record, settings: WelchSettings, response: FrequencyResponse
 ) -> tuple[str, ...]:
     """Return sentences on weaknesses of an estimate, such as few segments or a low resolution."""
-    sentences = []
+    warning_sentences = []
     is_welch = settings.estimator != "fft"
     segment_length = (
         settings.segmentation(record.rate_hz).segment_length if is_welch else len(record.time_s)
     )
     if is_welch and response.segments < PAPER_SEGMENTS:
-        sentences.append(
+        warning_sentences.append(
             f"Only {response.segments} Welch segment(s) of {segment_length} samples fit "
             "the sweep of "
-            f"{record.first_sweep_samples}{_segment_remedy(record.first_sweep_samples)}"
+            f"{record.first_sweep_samples}{_segment_length_remedy(record.first_sweep_samples)}"
         )
     resolution_hz = record.rate_hz / segment_length
     first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)
     if resolution_hz > first_mode_hz:
-        sentences.append(
+        warning_sentences.append(
             f"A transform of {1 / resolution_hz:.3g} s resolves {resolution_hz:.3g} Hz and cannot "
             f"show the first mode, at {first_mode_hz:.3g} Hz; take longer segments, or record "
             "longer."
@@ -204,9 +205,9 @@ def estimate_warnings(
     excited_hz = record.excited_hz
     first_hz, last_hz = settings.band_hz
     if excited_hz is not None and (excited_hz[0] > first_hz or excited_hz[1] < last_hz):
-        sentences.append(
+        warning_sentences.append(
             f"The band {first_hz:g} to {last_hz:g} Hz reaches beyond the excitation "
             f"({excited_hz[0]:g} to {excited_hz[1]:g} Hz): what was not excited is noise; "
             "narrow --band."
         )
-    return tuple(sentences)
+    return tuple(warning_sentences)

@@ -49,13 +49,13 @@ from rigd.beam import DAMPING_PARAMETERS, Beam, Damping, Plant, ResponseGrid
 
 # Fits
 
-_FEW_POINTS: Final = 800
+_THINNED_POINT_COUNT: Final = 800
 """Number of points of the response in the first descents."""
-_REFINED_MINIMA: Final = 3
+_MAX_REFINED_MINIMA: Final = 3
 """Number of minima that are refined with all points."""
-_ROUGH_TOLERANCE: Final = 1e-5
+_ROUGH_COST_TOLERANCE: Final = 1e-5
 """Relative cost reduction in a step below which the first descents end."""
-_REFINED_TOLERANCE: Final = 1e-12
+_REFINED_COST_TOLERANCE: Final = 1e-12
 """Relative cost reduction in a step below which the refinement of a minimum ends."""
 _SAME_MINIMUM_DISTANCE: Final = 0.02
 """Difference in an unknown above which two descents count as ended at different minima."""
@@ -197,24 +197,26 @@ def fit_many(
     # The torque sensor is under the clamp: the inertia of the tool is added to the model, and never
     # subtracted from the data.
     undamped_plant = Plant(beam, Damping(), tool_inertia_kg_m2=tool_inertia_kg_m2)
-    whole_grid = ResponseGrid(s)
-    grids_by_weighting: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
+    full_grid = ResponseGrid(s)
+    thinned_and_full_grids: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
     for weighting in weightings:
-        all_weights = weights(omega_rad_s, weighting)
-        point_index, point_weights = representative_points(response, all_weights, _FEW_POINTS)
-        few_points_grid = ResponseGrid(s[point_index])
-        grids_by_weighting.append(
+        full_grid_weights = weights(omega_rad_s, weighting)
+        point_index, point_weights = representative_points(
+            response, full_grid_weights, _THINNED_POINT_COUNT
+        )
+        thinned_grid = ResponseGrid(s[point_index])
+        thinned_and_full_grids.append(
             (
-                _FrequencyGrid(
-                    few_points_grid, undamped_plant, response[point_index], point_weights
-                ),
-                _FrequencyGrid(whole_grid, undamped_plant, response, all_weights),
+                _FrequencyGrid(thinned_grid, undamped_plant, response[point_index], point_weights),
+                _FrequencyGrid(full_grid, undamped_plant, response, full_grid_weights),
             )
         )
     return tuple(
-        _fit(structure, weighting_name(weighting), thinned_grid, full_grid)
+        _fit_structure(structure, weighting_name(weighting), thinned_grid, full_grid)
         for structure in structures
-        for weighting, (thinned_grid, full_grid) in zip(weightings, grids_by_weighting, strict=True)
+        for weighting, (thinned_grid, full_grid) in zip(
+            weightings, thinned_and_full_grids, strict=True
+        )
     )
 
 
@@ -228,7 +230,7 @@ class _FrequencyGrid:
 
     response_grid: ResponseGrid
     undamped_plant: Plant
-    measured: NDArray[np.complex128]
+    measured_response: NDArray[np.complex128]
     weights: NDArray[np.float64]
 
     def evaluate(self, damping: Damping, wrt: Sequence[str] = ()) -> NDArray[np.complex128]:
@@ -246,20 +248,20 @@ class _FrfProblem:
 
     def cost(self, x: NDArray[np.float64]) -> float:
         """Return the cost (Eq. 26) at the unknowns x."""
-        deviation = self.grid.evaluate(self.unknowns.damping(x))[0] - self.grid.measured
+        deviation = self.grid.evaluate(self.unknowns.damping(x))[0] - self.grid.measured_response
         return float(self.grid.weights @ (deviation.real**2 + deviation.imag**2))
 
     def deviation_and_jacobian(self, x: NDArray[np.float64]) -> _Linearization:
         """Return model minus measurement, (n,), and its derivatives with respect to x, (k, n)."""
-        return self._recent_linearizations.value_at(x, self._linearize)
+        return self._recent_linearizations.value_at(x, self._deviation_and_jacobian_at)
 
-    def _linearize(self, x: NDArray[np.float64]) -> _Linearization:
+    def _deviation_and_jacobian_at(self, x: NDArray[np.float64]) -> _Linearization:
         """Compute model minus measurement and its derivatives with respect to x."""
         response_and_derivatives = self.grid.evaluate(
             self.unknowns.damping(x), self.unknowns.structure.free
         )
         jacobian = self.unknowns.derivative_of_parameters(x).T @ response_and_derivatives[1:]
-        return response_and_derivatives[0] - self.grid.measured, jacobian
+        return response_and_derivatives[0] - self.grid.measured_response, jacobian
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Return cost, gradient and Gauss-Newton Hessian at the unknowns x."""
@@ -272,21 +274,23 @@ class _FrfProblem:
         )
 
 
-def _fit(
+def _fit_structure(
     structure: Structure,
     weighting: str,
-    few_points_grid: _FrequencyGrid,
-    whole_grid: _FrequencyGrid,
+    thinned_grid: _FrequencyGrid,
+    full_grid: _FrequencyGrid,
 ) -> FrfFit:
     """Fit a damping structure: descents on few points, then refinement on all points."""
-    unknowns = DampingUnknowns.for_beam(structure, whole_grid.undamped_plant.beam)
+    unknowns = DampingUnknowns.for_beam(structure, full_grid.undamped_plant.beam)
     bounds = ConstantBounds(*unknowns.bounds)
-    thinned_problem, whole_problem = (
-        _FrfProblem(unknowns, few_points_grid),
-        _FrfProblem(unknowns, whole_grid),
+    thinned_problem, full_problem = (
+        _FrfProblem(unknowns, thinned_grid),
+        _FrfProblem(unknowns, full_grid),
     )
     rough_minima = [
-        descend(thinned_problem.normal_equations, x, bounds, relative_tolerance=_ROUGH_TOLERANCE)
+        descend(
+            thinned_problem.normal_equations, x, bounds, relative_tolerance=_ROUGH_COST_TOLERANCE
+        )
         for x in starting_points(structure, thinned_problem.cost)
     ]
     # The descents first converge on the few points. With the Hessian estimated there, one or two
@@ -294,11 +298,11 @@ def _fit(
     refined_minima = _distinct_minima(
         [
             _refine(thinned_problem, rough_minimum, bounds)
-            for rough_minimum in _distinct_minima(rough_minima)[:_REFINED_MINIMA]
+            for rough_minimum in _distinct_minima(rough_minima)[:_MAX_REFINED_MINIMA]
         ]
     )
     refined_minima = [
-        _refine(whole_problem, rough_minimum, bounds) for rough_minimum in refined_minima
+        _refine(full_problem, rough_minimum, bounds) for rough_minimum in refined_minima
     ]
     best_minimum = min(refined_minima, key=lambda minimum: minimum.cost)
     parameters = unknowns.parameters(best_minimum.x)
@@ -310,7 +314,7 @@ def _fit(
         parameters={
             parameter_name: parameters[parameter_name] for parameter_name in DAMPING_PARAMETERS
         },
-        std=None if are_at_bound.any() else _standard_deviations(whole_problem, best_minimum.x),
+        std=None if are_at_bound.any() else _standard_deviations(full_problem, best_minimum.x),
         cost=best_minimum.cost,
         at_bounds=tuple(
             parameter_name
@@ -326,7 +330,7 @@ def _refine(frf_problem: _FrfProblem, rough_minimum: Minimum, bounds: ConstantBo
         frf_problem.normal_equations,
         rough_minimum.x,
         bounds,
-        relative_tolerance=_REFINED_TOLERANCE,
+        relative_tolerance=_REFINED_COST_TOLERANCE,
         second_part=rough_minimum.second_part,
     )
 
@@ -366,11 +370,11 @@ def _check_response(
     structures: tuple[Structure, ...],
 ) -> None:
     """Raise if a response has too few points, values that are not finite, or a frequency of 0."""
-    needed_points = max((len(structure.free) for structure in structures), default=0)
-    if frequency_hz.size < max(needed_points, 3):
+    min_point_count = max((len(structure.free) for structure in structures), default=0)
+    if frequency_hz.size < max(min_point_count, 3):
         raise FitError(
             f"The band holds {frequency_hz.size} points of the frequency response, too few for "
-            f"{needed_points} unknowns; widen the band."
+            f"{min_point_count} unknowns; widen the band."
         )
     if not (np.isfinite(response).all() and frequency_hz[0] > 0):
         raise FitError(
@@ -404,9 +408,9 @@ def representative_points(
         Weight of each chosen point, to which the weights of omitted points around it are added.
         Their sum is 1.
     """
-    n = measured_response.size
-    if n <= point_count:
-        return np.arange(n), weights
+    bin_count = measured_response.size
+    if bin_count <= point_count:
+        return np.arange(bin_count), weights
     # The density of the points has three equal parts: uniform, by the size of the response, and by
     # its change from bin to bin. With 800 of 7907 points, the cost at a minimum then differs by
     # less than 1 % from the cost with all points.
@@ -415,7 +419,7 @@ def representative_points(
         root_weights * np.abs(measured_response),
         root_weights * np.abs(np.gradient(measured_response)),
     )
-    point_density = np.full(n, 1 / n)
+    point_density = np.full(bin_count, 1 / bin_count)
     for weight_density in (weighted_magnitude, weighted_variation):
         point_density += weight_density / max(float(weight_density.sum()), np.finfo(float).tiny)
     cumulative_density = np.cumsum(point_density)
@@ -427,7 +431,7 @@ def representative_points(
 
 # Starts
 
-_START_GRID: Final[dict[str, tuple[float, ...]]] = {
+_STARTING_GRID_VALUES: Final[dict[str, tuple[float, ...]]] = {
     "zeta": tuple(math.log(size) for size in (1e-4, 1e-3, 1e-2, 1e-1)),
     "alpha": (0.3, 0.8, 1.3, 1.8),
     "gamma": tuple(math.log(size) for size in (1e-3, 1e-2, 1e-1, 1.0)),
@@ -435,7 +439,7 @@ _START_GRID: Final[dict[str, tuple[float, ...]]] = {
 }
 """Values of the unknowns in the coarse grid. The unknown for a coefficient is the logarithm of the
 damping relative to stiffness or inertia at a mode, which is about twice a damping ratio."""
-_MAX_STARTS: Final = 8
+_MAX_STARTING_POINTS: Final = 8
 """Largest number of descents for each structure."""
 
 
@@ -447,22 +451,22 @@ def starting_points(
     `cost` is a function of the vector of unknowns, shape (k,). Return at most eight points of the
     coarse grid, shape (k,), that have no neighbour of lower cost along any axis.
     """
-    parameter_axes = [_START_GRID[parameter_name] for parameter_name in structure.free]
+    parameter_axes = [_STARTING_GRID_VALUES[parameter_name] for parameter_name in structure.free]
     grid_points = np.array(list(itertools.product(*parameter_axes)))
     grid_costs = np.array([cost(x) for x in grid_points]).reshape(
         [len(axis) for axis in parameter_axes]
     )
-    is_minimum = np.ones(grid_costs.shape, dtype=bool)
+    is_local_minimum = np.ones(grid_costs.shape, dtype=bool)
     for axis in range(grid_costs.ndim):
         cost_differences = np.diff(grid_costs, axis=axis)
         # A point is no minimum if the next or the previous point along the axis has a lower cost.
-        pad_end = [(0, 1) if k == axis else (0, 0) for k in range(grid_costs.ndim)]
-        pad_start = [(1, 0) if k == axis else (0, 0) for k in range(grid_costs.ndim)]
-        is_minimum &= np.pad(cost_differences, pad_end) >= 0
-        is_minimum &= np.pad(cost_differences, pad_start) <= 0
-    minimum_indices = np.flatnonzero(is_minimum)
-    sorted_minima = minimum_indices[np.argsort(grid_costs.ravel()[minimum_indices])]
-    return [grid_points[i] for i in sorted_minima[:_MAX_STARTS]]
+        padding_at_end = [(0, 1) if k == axis else (0, 0) for k in range(grid_costs.ndim)]
+        padding_at_start = [(1, 0) if k == axis else (0, 0) for k in range(grid_costs.ndim)]
+        is_local_minimum &= np.pad(cost_differences, padding_at_end) >= 0
+        is_local_minimum &= np.pad(cost_differences, padding_at_start) <= 0
+    minimum_indices = np.flatnonzero(is_local_minimum)
+    minima_by_cost = minimum_indices[np.argsort(grid_costs.ravel()[minimum_indices])]
+    return [grid_points[i] for i in minima_by_cost[:_MAX_STARTING_POINTS]]
 
 
 # Covariance
@@ -491,24 +495,26 @@ def sandwich_covariance(
     if np.linalg.cond(scaled_hessian) > 1e12:
         return None
     gradient_terms = (jacobian.conj() * (weights * deviation)).real
-    correlated_bins = _correlated_bins(np.sqrt(weights) * deviation)
+    correlated_bin_count = _count_correlated_bins(np.sqrt(weights) * deviation)
     # Bartlett's kernel over a number of bins equals the mean square of sums over as many
     # neighbours.
     cumulative_terms = np.cumsum(
-        np.pad(gradient_terms, ((0, 0), (correlated_bins, correlated_bins - 1))), axis=1
+        np.pad(gradient_terms, ((0, 0), (correlated_bin_count, correlated_bin_count - 1))), axis=1
     )
-    neighbour_sums = cumulative_terms[:, correlated_bins:] - cumulative_terms[:, :-correlated_bins]
-    gradient_covariance = neighbour_sums @ neighbour_sums.T / correlated_bins
+    neighbour_sums = (
+        cumulative_terms[:, correlated_bin_count:] - cumulative_terms[:, :-correlated_bin_count]
+    )
+    gradient_covariance = neighbour_sums @ neighbour_sums.T / correlated_bin_count
     inverse_hessian = np.linalg.inv(scaled_hessian) / np.outer(hessian_scales, hessian_scales)
     covariance: NDArray[np.float64] = inverse_hessian @ gradient_covariance @ inverse_hessian
     return covariance
 
 
-def _correlated_bins(deviation: NDArray[np.complex128]) -> int:
+def _count_correlated_bins(deviation: NDArray[np.complex128]) -> int:
     """Return the number of correlated neighbouring bins, from the lag of a correlation of 0.5."""
-    half_correlation = 0.5 * np.vdot(deviation, deviation).real
+    half_power = 0.5 * np.vdot(deviation, deviation).real
     # Only a few lags are needed. FFTs would cost as much as the model at every point.
     for lag in range(1, deviation.size):
-        if np.vdot(deviation[:-lag], deviation[lag:]).real < half_correlation:
+        if np.vdot(deviation[:-lag], deviation[lag:]).real < half_power:
             return 1 + 2 * lag
     return 1

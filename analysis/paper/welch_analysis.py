@@ -144,32 +144,36 @@ def resonant_peaks(
     2.50 Hz, 18.1 dB
     """
     magnitude = np.abs(response)
-    border_ratios = np.sqrt(mode_hz[1:] / mode_hz[:-1])
+    border_frequency_ratios = np.sqrt(mode_hz[1:] / mode_hz[:-1])
     # The peak of a single mode is searched within half an octave on either side.
     first_ratio, last_ratio = (
-        (border_ratios[0], border_ratios[-1])
-        if border_ratios.size
+        (border_frequency_ratios[0], border_frequency_ratios[-1])
+        if border_frequency_ratios.size
         else (np.sqrt(2.0), np.sqrt(2.0))
     )
-    lower_borders_hz = mode_hz / np.concatenate(([first_ratio], border_ratios))
-    upper_borders_hz = mode_hz * np.concatenate((border_ratios, [last_ratio]))
+    lower_borders_hz = mode_hz / np.concatenate(([first_ratio], border_frequency_ratios))
+    upper_borders_hz = mode_hz * np.concatenate((border_frequency_ratios, [last_ratio]))
     inner_magnitude = magnitude[1:-1]
-    maximum_bins = 1 + np.flatnonzero(
+    local_maximum_bins = 1 + np.flatnonzero(
         (inner_magnitude > magnitude[:-2]) & (inner_magnitude >= magnitude[2:])
     )
-    resonant_peak_list: list[Peak | None] = []
+    peaks_of_modes: list[Peak | None] = []
     for low, end_bin in zip(lower_borders_hz, upper_borders_hz, strict=True):
-        candidate_bins = maximum_bins[
-            (frequency_hz[maximum_bins] >= low) & (frequency_hz[maximum_bins] <= end_bin)
+        candidate_bins = local_maximum_bins[
+            (frequency_hz[local_maximum_bins] >= low)
+            & (frequency_hz[local_maximum_bins] <= end_bin)
         ]
         if candidate_bins.size == 0:
-            resonant_peak_list.append(None)
+            peaks_of_modes.append(None)
             continue
-        largest_bin = candidate_bins[np.argmax(magnitude[candidate_bins])]
-        resonant_peak_list.append(
-            Peak(float(frequency_hz[largest_bin]), 20 * float(np.log10(magnitude[largest_bin])))
+        largest_peak_bin = candidate_bins[np.argmax(magnitude[candidate_bins])]
+        peaks_of_modes.append(
+            Peak(
+                float(frequency_hz[largest_peak_bin]),
+                20 * float(np.log10(magnitude[largest_peak_bin])),
+            )
         )
-    return tuple(resonant_peak_list)
+    return tuple(peaks_of_modes)
 
 
 def peak_deviation(measured_peak: Peak, model_peak: Peak) -> PeakDeviation:
@@ -198,7 +202,7 @@ def peak_deviation(measured_peak: Peak, model_peak: Peak) -> PeakDeviation:
 
 # Torque in time
 
-_DECAY_OVER_RECORD = 2.7
+_DECAY_EXPONENT_OVER_RECORD = 2.7
 """Decay rate sigma times the duration T of the record in `modelled_torque`. Circular wrap-around is
 reduced by exp(-2 sigma T), rounding errors grow by exp(sigma T)."""
 
@@ -223,15 +227,19 @@ def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
         Torque in N·m as the sensor would report it at the record's time stamps.
     """
     sample_count = len(record.angle_rad)
-    padded_samples = 1 << (2 * sample_count - 1).bit_length()
+    padded_sample_count = 1 << (2 * sample_count - 1).bit_length()
     transform = CausalTransform(
-        padded_samples, record.rate_hz, _DECAY_OVER_RECORD * padded_samples / sample_count
+        padded_sample_count,
+        record.rate_hz,
+        _DECAY_EXPONENT_OVER_RECORD * padded_sample_count / sample_count,
     )
     s = transform.s
-    origin_rad = record.angle_rad[0] if record.rest_angle_rad is None else record.rest_angle_rad
+    initial_angle_rad = (
+        record.angle_rad[0] if record.rest_angle_rad is None else record.rest_angle_rad
+    )
     torque_response = transfer(s, record.beam, damping) + record.tool_inertia_kg_m2 * s**2
     torque_response *= np.exp(-s * (record.torque_delay_s - record.angle_delay_s))
-    return transform.convolve(record.angle_rad - origin_rad, torque_response)
+    return transform.convolve(record.angle_rad - initial_angle_rad, torque_response)
 
 
 def band_limited(
@@ -253,14 +261,14 @@ def band_limited(
     ndarray, shape (n,)
         Filtered signal.
     """
-    padded_samples = 1 << (2 * len(signal_values) - 1).bit_length()
-    frequency_hz = np.fft.rfftfreq(padded_samples, 1.0 / rate_hz)
-    spectrum = np.fft.rfft(signal_values, padded_samples)
+    padded_sample_count = 1 << (2 * len(signal_values) - 1).bit_length()
+    frequency_hz = np.fft.rfftfreq(padded_sample_count, 1.0 / rate_hz)
+    spectrum = np.fft.rfft(signal_values, padded_sample_count)
     spectrum[(frequency_hz < band_hz[0]) | (frequency_hz > band_hz[1])] = 0.0
-    return np.asarray(np.fft.irfft(spectrum, padded_samples)[: len(signal_values)])
+    return np.asarray(np.fft.irfft(spectrum, padded_sample_count)[: len(signal_values)])
 
 
-_ENVELOPE_HALF_WIDTH: Final = 0.1
+_RELATIVE_ENVELOPE_HALF_WIDTH: Final = 0.1
 """Half width of the band in which an envelope is computed, relative to its centre frequency."""
 
 
@@ -292,20 +300,20 @@ def largest_oscillation_time_s(
     >>> print(f"{largest_oscillation_time_s(values, 1000, 5.0):.2f} s")
     4.00 s
     """
-    padded_samples = 1 << (len(signal_values) - 1).bit_length()
-    frequencies_hz = np.fft.rfftfreq(padded_samples, 1.0 / rate_hz)
-    in_band = np.abs(frequencies_hz / frequency_hz - 1.0) <= _ENVELOPE_HALF_WIDTH
-    analytic_signal = np.zeros(padded_samples, dtype=np.complex128)
-    analytic_signal[: len(frequencies_hz)][in_band] = np.fft.rfft(signal_values, padded_samples)[
-        in_band
-    ]
+    padded_sample_count = 1 << (len(signal_values) - 1).bit_length()
+    frequencies_hz = np.fft.rfftfreq(padded_sample_count, 1.0 / rate_hz)
+    in_band = np.abs(frequencies_hz / frequency_hz - 1.0) <= _RELATIVE_ENVELOPE_HALF_WIDTH
+    analytic_signal = np.zeros(padded_sample_count, dtype=np.complex128)
+    analytic_signal[: len(frequencies_hz)][in_band] = np.fft.rfft(
+        signal_values, padded_sample_count
+    )[in_band]
     envelope = np.abs(np.fft.ifft(analytic_signal)[: len(signal_values)])
     return float(np.argmax(envelope)) / rate_hz
 
 
 # Analysis of a record
 
-MODES: Final = 3
+EVALUATED_MODE_COUNT: Final = 3
 """Number of modes whose peaks and poles are evaluated."""
 
 LARGEST_FREQUENCY_SHIFT: Final = 0.1
@@ -328,7 +336,7 @@ class FittedModel:
     modes : tuple of Mode
         Modes of the beam without tool inertia, from its poles; empty if strong damping leaves a
         mode without a pole.
-    followed : tuple of bool
+    are_near_undamped : tuple of bool
         Whether each mode's frequency is within `LARGEST_FREQUENCY_SHIFT` of the undamped beam's. If
         not, the fit does not describe that resonance of the antenna.
     peaks : tuple of Peak or None
@@ -341,7 +349,7 @@ class FittedModel:
     response: NDArray[np.complex128]
     indices: FitIndices
     modes: tuple[Mode, ...]
-    followed: tuple[bool, ...]
+    are_near_undamped: tuple[bool, ...]
     peaks: tuple[Peak | None, ...]
     deviations: tuple[PeakDeviation | None, ...]
 
@@ -398,7 +406,7 @@ def analyse(record: Record, settings: WelchSettings) -> WelchAnalysis:
     FrequencyResponseError
         The motor did not move, or the record is too short for the segments.
     """
-    _check_excited(record)
+    _check_excitation(record)
     main_response, whole_record = estimate(record, settings)
     measured_peaks = _mode_peaks(record.beam, main_response.frequency_hz, main_response.response)
     response_grid = ResponseGrid(2j * np.pi * main_response.frequency_hz)
@@ -428,7 +436,7 @@ def analyse(record: Record, settings: WelchSettings) -> WelchAnalysis:
     )
 
 
-def _check_excited(record: Record) -> None:
+def _check_excitation(record: Record) -> None:
     """Raise if the motor did not move during a record."""
     known_angles_rad = record.angle_rad[record.angle_known]
     if record.metadata.get("excitation") == "hold":
@@ -446,7 +454,7 @@ def _check_excited(record: Record) -> None:
 def _evaluate_fit(
     fit: FrfFit,
     record: Record,
-    measured: FrequencyResponse,
+    measured_response: FrequencyResponse,
     response_grid: ResponseGrid,
     measured_peaks: tuple[Peak | None, ...],
 ) -> FittedModel:
@@ -454,17 +462,19 @@ def _evaluate_fit(
     beam = record.beam
     plant = Plant(beam, fit.damping, tool_inertia_kg_m2=record.tool_inertia_kg_m2)
     (model_response,) = response_grid.evaluate(plant)
-    model_peaks = _mode_peaks(beam, measured.frequency_hz, model_response)
+    model_peaks = _mode_peaks(beam, measured_response.frequency_hz, model_response)
     try:
-        beam_modes = modes(beam, fit.damping, MODES)
+        beam_modes = modes(beam, fit.damping, EVALUATED_MODE_COUNT)
     except ArithmeticError:
         beam_modes = ()
     return FittedModel(
         fit=fit,
         response=model_response,
-        indices=fit_indices(2 * np.pi * measured.frequency_hz, measured.response, model_response),
+        indices=fit_indices(
+            2 * np.pi * measured_response.frequency_hz, measured_response.response, model_response
+        ),
         modes=beam_modes,
-        followed=_vibrate_near_undamped(beam_modes, beam),
+        are_near_undamped=_are_near_undamped_modes(beam_modes, beam),
         peaks=model_peaks,
         deviations=tuple(
             None
@@ -475,9 +485,9 @@ def _evaluate_fit(
     )
 
 
-def _vibrate_near_undamped(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
+def _are_near_undamped_modes(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
     """Return for each fitted mode whether its frequency is near the undamped beam's."""
-    undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
+    undamped_hz = undamped_frequencies_rad_s(beam, EVALUATED_MODE_COUNT) / (2 * np.pi)
     return tuple(
         fitted_mode.damping_ratio < 1
         and abs(fitted_mode.frequency_hz / mode_hz - 1) < LARGEST_FREQUENCY_SHIFT
@@ -489,5 +499,5 @@ def _mode_peaks(
     beam: Beam, frequency_hz: NDArray[np.float64], response: NDArray[np.complex128]
 ) -> tuple[Peak | None, ...]:
     """Return the resonant peaks of a response near the beam's first undamped frequencies."""
-    mode_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
+    mode_hz = undamped_frequencies_rad_s(beam, EVALUATED_MODE_COUNT) / (2 * np.pi)
     return resonant_peaks(frequency_hz, response, mode_hz)

@@ -392,7 +392,9 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
         fitted_model: FittedModel, value_name: str, number_format: str, display_factor: float = 1.0
     ) -> list[Cell]:
         mode_cells = []
-        for mode, is_followed in zip(fitted_model.modes, fitted_model.followed, strict=True):
+        for mode, is_followed in zip(
+            fitted_model.modes, fitted_model.are_near_undamped, strict=True
+        ):
             cell = number_cell(
                 getattr(mode, value_name) if mode.damping_ratio < 1 else None,
                 number_format,
@@ -406,7 +408,7 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     modes_with_flags = [
         mode_with_flag
         for fitted_model in fitted_models
-        for mode_with_flag in zip(fitted_model.modes, fitted_model.followed, strict=True)
+        for mode_with_flag in zip(fitted_model.modes, fitted_model.are_near_undamped, strict=True)
     ]
     is_underdamped = [mode.damping_ratio < 1 for mode, _ in modes_with_flags]
     table_notes = ["From the poles of the fitted model; ξ is the damping ratio."]

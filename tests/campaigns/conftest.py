@@ -181,7 +181,9 @@ def welch_fit(structure, weighting, at_bounds=(), **free):
     damping = STRUCTURES[structure].damping(values)
     fit = FrfFit(STRUCTURES[structure], weighting, damping, values, None, 1.0, at_bounds)
     no_response, indices = np.empty(0, complex), FitIndices(1.0, 1.0, 1.0)
-    return FittedModel(fit, no_response, indices, modes=(), followed=(), peaks=(), deviations=())
+    return FittedModel(
+        fit, no_response, indices, modes=(), are_near_undamped=(), peaks=(), deviations=()
+    )
 
 
 def record_estimate(structure, values, covariance, determined, at_bounds=(), cost=100.0, bic=0.0):

@@ -205,15 +205,17 @@ def test_file_with_required_content_only(write_session, paper_signals, paper_ana
 
 
 def test_modes_followed_by_a_fit_are_reported(paper_analysis, paper_file):
-    assert all(model.followed == (True, True, True) for model in paper_analysis.models)
+    assert all(model.are_near_undamped == (True, True, True) for model in paper_analysis.models)
     # One segment of 20 s of the sweep, whose resonances the window fades out.
     record = load_record(paper_file)
     short = replace(record, sweep=slice(record.sweep.start, record.sweep.start + 20_000))
     found = analyse(short, WelchSettings(types=("II", "IV", "VI")))
-    assert any(not all(model.followed) for model in found.models)
+    assert any(not all(model.are_near_undamped) for model in found.models)
     for model in found.models:
-        assert len(model.followed) == len(model.modes)
-        followed = [mode for mode, is_so in zip(model.modes, model.followed, strict=True) if is_so]
+        assert len(model.are_near_undamped) == len(model.modes)
+        followed = [
+            mode for mode, is_so in zip(model.modes, model.are_near_undamped, strict=True) if is_so
+        ]
         frequencies_hz = [mode.frequency_hz for mode in followed]
         assert frequencies_hz == sorted(frequencies_hz)
         assert all(0 < mode.damping_ratio < 1 for mode in followed)

@@ -120,13 +120,13 @@ def test_overdamped_modes_are_left_out(write_session, short_signals, tmp_path, t
     damping = replace(model.fit.damping, gamma=14.0)
     found = modes(record.beam, damping, 3)
     assert found[0].damping_ratio > 1 > found[2].damping_ratio
-    strong = replace(model, modes=found, followed=(False, False, True))
+    strong = replace(model, modes=found, are_near_undamped=(False, False, True))
     text = tables_text(replace(analyse(record, settings), models=(strong,)))
     shown = rows(text, "II", "const")[2][2:]
     assert shown[:2] == shown[3:5] == ["–", "–"]
     assert shown[2] == f"{found[2].frequency_hz:.4f}"
     assert "overdamped in this fit" in text
-    none = replace(strong, modes=(), followed=())
+    none = replace(strong, modes=(), are_near_undamped=())
     assert "overdamped in this fit" in tables_text(
         replace(analyse(record, settings), models=(model, none))
     )
@@ -139,7 +139,7 @@ def test_shifted_modes_are_marked(paper_analysis, tables_text):
     assert [float(hz) for hz in last[:3]] == sorted(float(hz) for hz in last[:3])
     *others, model = paper_analysis.models
     slow = replace(model.modes[2], frequency_hz=8.5)
-    left = replace(model, modes=(*model.modes[:2], slow), followed=(True, True, False))
+    left = replace(model, modes=(*model.modes[:2], slow), are_near_undamped=(True, True, False))
     text, (unmarked, marked) = modes_rows(
         tables_text(replace(paper_analysis, models=(*others, left)))
     )

@@ -21,7 +21,7 @@ _DELIVERED_TAGS: Final = {
     "comrdtbsiz": "1", "mfgdigver": "2.2.59",
 }  # fmt: skip
 """Settings on the page of a box as delivered, by tag."""
-_LONGEST_PAUSE_S = 0.1
+_MAX_SENT_BACKLOG_S = 0.1
 """Time in seconds up to which the records since the last tick are sent; older ones are dropped."""
 _PROBABILITIES, _DURATIONS = ("loss", "duplicate", "reorder", "malformed"), ("burst", "saturate")
 """Names of the faults whose value is a probability, and of those with a duration in seconds."""
@@ -55,26 +55,30 @@ class SimulatedBox:
         self._sequence, self._record_index = 0, 700
         self._held_packets: list[bytes] = []
 
-    def get(self, path: str) -> str:
+    def get_page(self, path: str) -> str:
         """Return the web server's answer to a request for a path, or raise OSError."""
         if "no_page" in self._faults:
             raise ConnectionRefusedError("connection refused")
         if path == SETTINGS_PATH:
-            text = "".join(f"<{tag}>{value}</{tag}>\n" for tag, value in self.tags.items())
-            return f"<netft>\n{text}</netft>\n"
+            settings_text = "".join(f"<{tag}>{value}</{tag}>\n" for tag, value in self.tags.items())
+            return f"<netft>\n{settings_text}</netft>\n"
         if (form := urlsplit(path)).path not in (COMMUNICATION_FORM, SENSOR_FORM):
             raise OSError("HTTP status 404")
         self._form_count += 1
         if self._form_count > 3:  # a box drops some of several forms
             return ""
-        values = dict(parse_qsl(form.query))
-        if "comrdte" in values:
-            values["comrdte"] = "Enabled" if values["comrdte"] == "1" else "Disabled"
-        if "comrdtrate" in values:
-            values["comrdtrate"] = f"{int(protocol.rate_reached_hz(float(values['comrdtrate'])))}"
-        if "setbias0" in values:
-            values["setbias"] = ";".join(values.pop(f"setbias{axis}") for axis in range(6))
-        self.tags |= {tag: value for tag, value in values.items() if tag in self.tags}
+        form_values = dict(parse_qsl(form.query))
+        if "comrdte" in form_values:
+            form_values["comrdte"] = "Enabled" if form_values["comrdte"] == "1" else "Disabled"
+        if "comrdtrate" in form_values:
+            form_values["comrdtrate"] = (
+                f"{int(protocol.achieved_rate_hz(float(form_values['comrdtrate'])))}"
+            )
+        if "setbias0" in form_values:
+            form_values["setbias"] = ";".join(
+                form_values.pop(f"setbias{axis}") for axis in range(6)
+            )
+        self.tags |= {tag: value for tag, value in form_values.items() if tag in self.tags}
         return ""
 
     def open(self) -> None:
@@ -91,9 +95,9 @@ class SimulatedBox:
         Before the first tick `due_ns` is 0: each call then returns the packets of 1 ms, and a time
         later than that of any tick.
         """
-        since_last_s = (due_ns - self._due_ns) / 1e9 if self._due_ns else 1e-3
+        since_last_tick_s = (due_ns - self._due_ns) / 1e9 if self._due_ns else 1e-3
         self._due_ns = due_ns
-        return self.packets(min(since_last_s, _LONGEST_PAUSE_S)), due_ns or 1 << 62
+        return self.packets(min(since_last_tick_s, _MAX_SENT_BACKLOG_S)), due_ns or 1 << 62
 
     def packets(self, duration_s: float) -> list[bytes]:
         """Return the packets of the records in a time span, at least one, after the faults."""
@@ -105,37 +109,43 @@ class SimulatedBox:
             ("cfgcpt", "scfgtu", protocol.TORQUE_UNITS_NM),
         ):  # fmt: skip
             counts_per_unit += 3 * [float(tags[tag]) / units[protocol.unit_key(tags[unit_tag])]]
-        counts = tuple(map(round, map(mul, self._read_wrench(), counts_per_unit)))
-        count = max(1, round(duration_s * float(tags["comrdtrate"])))
+        axis_counts = tuple(map(round, map(mul, self._read_wrench(), counts_per_unit)))
+        record_count = max(1, round(duration_s * float(tags["comrdtrate"])))
         return [
-            packet for _ in range(count) for packet in self._arriving_packets(self._record(counts))
+            packet
+            for _ in range(record_count)
+            for packet in self._arriving_packets(self._make_record(axis_counts))
         ]
 
     def close(self) -> None:
         """Do nothing: there is no socket."""
 
-    def _is_active(self, fault: str) -> bool:
+    def _is_active(self, fault_name: str) -> bool:
         """Return whether a fault acts on the present record."""
-        value, from_s = self._faults.get(fault, (0.0, inf))
+        value, from_s = self._faults.get(fault_name, (0.0, inf))
         elapsed_s = self._sequence / float(self.tags["comrdtrate"]) - from_s
-        if fault in _PROBABILITIES:
+        if fault_name in _PROBABILITIES:
             return elapsed_s >= 0 and self._random.random() < value
-        return 0 <= elapsed_s < (value if fault in _DURATIONS else inf)
+        return 0 <= elapsed_s < (value if fault_name in _DURATIONS else inf)
 
-    def _record(self, counts: tuple[int, ...]) -> bytes:
+    def _make_record(self, axis_counts: tuple[int, ...]) -> bytes:
         """Return the next record of the stream, with these counts of the six axes."""
         if self._is_active("restart") and not self._has_restarted:
             self._has_restarted, self._sequence, self._record_index = True, 0, 0
         self._sequence, self._record_index = self._sequence + 1, self._record_index + 1
-        status = 0
-        for fault, bits in (
+        status_word = 0
+        for fault_name, bits in (
             ("saturate", protocol.NETFT.saturation_bits), ("threshold", protocol.THRESHOLD_BIT),
             ("status", int(self._faults.get("status", (0, 0))[0])),
         ):  # fmt: skip
-            status |= bits | protocol.ANY_ERROR_BIT if self._is_active(fault) else 0
+            status_word |= bits | protocol.ANY_ERROR_BIT if self._is_active(fault_name) else 0
         # By the index and not by the clock, so that a burst has no equal counters.
-        counter = round(self._record_index * protocol.COUNTER_HZ / float(self.tags["comrdtrate"]))
-        return protocol.RECORD_LAYOUT.pack(self._sequence, counter & 0xFFFFFFFF, status, *counts)
+        box_counter = round(
+            self._record_index * protocol.COUNTER_HZ / float(self.tags["comrdtrate"])
+        )
+        return protocol.RECORD_LAYOUT.pack(
+            self._sequence, box_counter & 0xFFFFFFFF, status_word, *axis_counts
+        )
 
     def _arriving_packets(self, record: bytes) -> list[bytes]:
         """Apply the faults of the network to a record; return the packets that arrive now."""
@@ -157,17 +167,17 @@ class SimulatedBox:
         return packets
 
 
-def _parse_fault(text: str) -> tuple[str, tuple[float, float]]:
+def _parse_fault(fault_text: str) -> tuple[str, tuple[float, float]]:
     """Parse a fault; return its name, and its value and start time in seconds."""
-    name_and_value, _, from_s = text.partition("@")
+    name_and_value, _, from_s = fault_text.partition("@")
     name, _, value = name_and_value.partition("=")
     try:
-        number = int(value, 0) if value.startswith("0x") else float(value or 0)
+        fault_value = int(value, 0) if value.startswith("0x") else float(value or 0)
         if name in FAULTS:
-            return name, (number, float(from_s or 0))
+            return name, (fault_value, float(from_s or 0))
     except ValueError:
         pass
-    raise DeviceError(f'netft.faults: "{text}"; faults are {", ".join(FAULTS)}.')
+    raise DeviceError(f'netft.faults: "{fault_text}"; faults are {", ".join(FAULTS)}.')
 
 
 def simulated_box(

@@ -6,7 +6,7 @@ from typing import Any, Final
 from rigd.devices.contracts import DeviceError, WrenchSensor
 from rigd.devices.declaration import DeviceKind, OpenedDrive
 from rigd.devices.parameters import RigParameters
-from rigd_netft.protocol import rate_reached_hz
+from rigd_netft.protocol import achieved_rate_hz
 from rigd_netft.settings import NetFtSettings
 
 
@@ -38,11 +38,11 @@ def open_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
 def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages on values of a profile that contradict each other or that no box has."""
     rate_hz, loop_hz = values["netft.rate_hz"], values["rig.rate_hz"]
-    reached_hz = rate_reached_hz(rate_hz)
-    if abs(reached_hz - rate_hz) > 0.5:
+    box_rate_hz = achieved_rate_hz(rate_hz)
+    if abs(box_rate_hz - rate_hz) > 0.5:
         yield (
             f"netft.rate_hz = {rate_hz:g} Hz is not 7000 Hz over a whole number; the box would "
-            f"send {reached_hz:.6g}: write that."
+            f"send {box_rate_hz:.6g}: write that."
         )
     if rate_hz < 2 * loop_hz and values["devices.drive"] != "sim":
         yield (

@@ -37,10 +37,10 @@ class BoxSettings:
     """Identity and settings that the box reported, for the session file."""
 
 
-def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings:
+def configure(settings: NetFtSettings, get_page: Callable[[str], str]) -> BoxSettings:
     """Set rate, filter and bias of the box as the profile says; read and check all settings.
 
-    `get` returns the web server's answer to a request for a path, or raises OSError.
+    `get_page` returns the web server's answer to a request for a path, or raises OSError.
 
     Raises
     ------
@@ -51,19 +51,22 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
         units_per_count = (1 / settings.counts_per_n,) * 3 + (1 / settings.counts_per_nm,) * 3
         assumed_settings = {"assumed": "counts, N and N·m, rate and filter of netft"}
         return BoxSettings(units_per_count, identity=assumed_settings)
-    communication = {
+    communication_settings = {
         "comrdte": "Enabled", "comrdtrate": f"{settings.rate_hz:g}", "comrdtbsiz": "1"
     }  # fmt: skip
-    setting = {"setuserfilter": str(get_args(protocol.CutOffHz).index(settings.filter_hz))}
+    sensor_settings = {"setuserfilter": str(get_args(protocol.CutOffHz).index(settings.filter_hz))}
     if settings.bias == "zero":
-        setting |= {f"setbias{axis}": "0" for axis in range(6)}
+        sensor_settings |= {f"setbias{axis}": "0" for axis in range(6)}
     try:
-        tags = _tags(get(SETTINGS_PATH))
-        for form, values in ((COMMUNICATION_FORM, communication), (SENSOR_FORM, setting)):
+        tags = _settings_by_tag(get_page(SETTINGS_PATH))
+        for form, values in (
+            (COMMUNICATION_FORM, communication_settings),
+            (SENSOR_FORM, sensor_settings),
+        ):
             if not all(_has_value(tags, *name_and_value) for name_and_value in values.items()):
                 # All in one request: a box drops some of several. The form has 1 for Enabled.
-                get(f"{form}?{urlencode(values).replace('Enabled', '1')}")
-        tags = _tags(get(SETTINGS_PATH))
+                get_page(f"{form}?{urlencode(values).replace('Enabled', '1')}")
+        tags = _settings_by_tag(get_page(SETTINGS_PATH))
     except OSError as error:
         raise DeviceError(
             f"{settings.box_name}: its web page "
@@ -72,15 +75,15 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
             "netft.counts_per_n and netft.counts_per_nm."
         ) from error
     try:
-        for tag, value in (communication | setting).items():
-            _require(
+        for tag, value in (communication_settings | sensor_settings).items():
+            _require_suitable(
                 _has_value(tags, tag, value), tags, tag, f"{value} was set; set it on the page"
             )
-        _require(
+        _require_suitable(
             _has_value(tags, "cfgtfx", ";".join(map(str, settings.tool_transform))), tags, "cfgtfx",
             f"netft.tool_transform is {settings.tool_transform}; correct one of them",
         )  # fmt: skip
-        _require(
+        _require_suitable(
             settings.serial_number in ("", tags.get("cfgcalsn")), tags, "cfgcalsn",
             f"netft.serial_number is {settings.serial_number}; connect the sensor of the profile, "
             "or correct the profile",
@@ -90,11 +93,11 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
         raise DeviceError(f"{settings.box_name}: its setting {error}.") from error
 
 
-def _tags(page: str) -> dict[str, str]:
+def _settings_by_tag(page: str) -> dict[str, str]:
     """Return the settings on a page by tag, the bias also as one setting per axis."""
     tags = {tag: value.strip() for tag, value in _SETTING_PATTERN.findall(page)}
-    offsets = tags.get("setbias", "").split(";")
-    return tags | {f"setbias{axis}": counts for axis, counts in enumerate(offsets) if counts}
+    bias_counts = tags.get("setbias", "").split(";")
+    return tags | {f"setbias{axis}": counts for axis, counts in enumerate(bias_counts) if counts}
 
 
 def _box_settings(tags: Mapping[str, str]) -> BoxSettings:
@@ -106,19 +109,19 @@ def _box_settings(tags: Mapping[str, str]) -> BoxSettings:
     ):
         unit_tag = next((each for each in unit_tags if each in tags), unit_tags[0])
         unit = protocol.unit_key(tags.get(unit_tag, ""))
-        _require(unit in units, tags, unit_tag, "unknown unit; choose another")
-        per_unit = _numbers(tags.get(tag, ""))
-        is_positive = len(per_unit) == 1 and per_unit[0] > 0
-        _require(is_positive, tags, tag, "not a number above 0; check the box")
-        counts_per_unit += 3 * per_unit
-        units_per_count += 3 * [units[unit] / per_unit[0]]
+        _require_suitable(unit in units, tags, unit_tag, "unknown unit; choose another")
+        counts_of_one_unit = _parse_numbers(tags.get(tag, ""))
+        is_positive = len(counts_of_one_unit) == 1 and counts_of_one_unit[0] > 0
+        _require_suitable(is_positive, tags, tag, "not a number above 0; check the box")
+        counts_per_unit += 3 * counts_of_one_unit
+        units_per_count += 3 * [units[unit] / counts_of_one_unit[0]]
     identity: dict[str, object] = {name: tags.get(tag, "") for name, tag in _IDENTITY_TAGS.items()}
-    ratings = _numbers(tags.get("cfgmr", ""))
-    if len(ratings) == 6:
+    axis_ratings = _parse_numbers(tags.get("cfgmr", ""))
+    if len(axis_ratings) == 6:
         identity["range"] = list(
-            map(prod, zip(ratings, counts_per_unit, units_per_count, strict=True))
+            map(prod, zip(axis_ratings, counts_per_unit, units_per_count, strict=True))
         )
-    counter_hz = max(0.0, *_numbers(tags.get("runrate", "0"))) or protocol.COUNTER_HZ
+    counter_hz = max(0.0, *_parse_numbers(tags.get("runrate", "0"))) or protocol.COUNTER_HZ
     is_axia = (
         "axia" in tags.get("prodname", "").lower() or "setadcrate" in tags or "setrate" in tags
     )
@@ -126,24 +129,24 @@ def _box_settings(tags: Mapping[str, str]) -> BoxSettings:
     return BoxSettings(tuple(units_per_count), kind, counter_hz, identity)
 
 
-def _require(is_suitable: bool, tags: Mapping[str, str], tag: str, reason: str) -> None:
+def _require_suitable(is_suitable: bool, tags: Mapping[str, str], tag: str, reason: str) -> None:
     """Raise ValueError with the setting's value and the reason unless the setting is suitable."""
     if not is_suitable:
         raise ValueError(f'{tag} is "{tags.get(tag, "")}", but {reason}')
 
 
-def _has_value(tags: Mapping[str, str], tag: str, wanted_value: str) -> bool:
+def _has_value(tags: Mapping[str, str], tag: str, required_value: str) -> bool:
     """Return whether a setting has the wanted_value value, or is not on the page."""
-    found_value = tags.get(tag, wanted_value)
+    page_value = tags.get(tag, required_value)
     return (
-        found_value.lower() == wanted_value.lower()
-        or _numbers(found_value) == _numbers(wanted_value) != []
+        page_value.lower() == required_value.lower()
+        or _parse_numbers(page_value) == _parse_numbers(required_value) != []
     )
 
 
-def _numbers(text: str) -> list[float]:
+def _parse_numbers(numbers_text: str) -> list[float]:
     """Parse numbers separated by semicolons; return an empty list if any is not a number."""
     try:
-        return [float(part) for part in text.split(";")]
+        return [float(part) for part in numbers_text.split(";")]
     except ValueError:
         return []

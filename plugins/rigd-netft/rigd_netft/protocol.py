@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final, Literal
 
-PORT: Final = 49152
+RDT_PORT: Final = 49152
 """UDP port of the box."""
 COUNTER_HZ: Final = 7000.0
 """Rate in Hz of the counter that a Net F/T box writes into its records."""
@@ -37,9 +37,9 @@ class BoxKind:
     bit_meanings: Mapping[int, str]
     """Meaning of each status bit, by bit number."""
 
-    def status_texts(self, word: int) -> list[str]:
+    def status_texts(self, status_word: int) -> list[str]:
         """Return the meanings of the bits that are set in a status word, highest bit first."""
-        set_bits = (bit for bit in range(30, -1, -1) if word >> bit & 1)
+        set_bits = (bit for bit in range(30, -1, -1) if status_word >> bit & 1)
         return [self.bit_meanings.get(bit, f"bit {bit}") for bit in set_bits]
 
 
@@ -75,19 +75,19 @@ CutOffHz = Literal[0, 838, 326, 152, 73, 35, 18, 8, 5, 1500, 2000, 2500, 3000]
 The position in this list is the number by which the box selects the filter."""
 
 
-def unit_key(name: str) -> str:
+def unit_key(unit_name: str) -> str:
     """Convert a unit's name on the page to its key in `FORCE_UNITS_N` or `TORQUE_UNITS_NM`."""
-    return re.sub(r"[^a-z]", "", name.lower())
+    return re.sub(r"[^a-z]", "", unit_name.lower())
 
 
-def counter_difference(later: int, earlier: int) -> int:
-    """Return `later` minus `earlier` for 32-bit counters that wrap around."""
-    return (later - earlier + 0x80000000 & 0xFFFFFFFF) - 0x80000000
+def counter_difference(later_count: int, earlier_count: int) -> int:
+    """Return `later_count` minus `earlier_count` for 32-bit counters that wrap around."""
+    return (later_count - earlier_count + 0x80000000 & 0xFFFFFFFF) - 0x80000000
 
 
-def rate_reached_hz(requested_hz: float) -> float:
+def achieved_rate_hz(requested_rate_hz: float) -> float:
     """Return the rate in Hz that a box uses if a rate is requested: 7000 Hz over an integer.
 
-    It is the lowest such rate that is not below `requested_hz`.
+    It is the lowest such rate that is not below `requested_rate_hz`.
     """
-    return COUNTER_HZ / max(1, int(COUNTER_HZ / requested_hz + 1e-9))
+    return COUNTER_HZ / max(1, int(COUNTER_HZ / requested_rate_hz + 1e-9))

@@ -22,21 +22,21 @@ _PAGE_TIMEOUT_S = 2.0
 """Largest time in seconds for connecting to the web page, and for each read from it."""
 _MAX_PAGE_BYTES = 1 << 16
 """Number of bytes of a web page that are read at most."""
-_BUFFER_BYTES = 4 << 20
+_RECEIVE_BUFFER_BYTES = 4 << 20
 """Requested size of the kernel's buffer; the usual 212 992 bytes hold 256 small packets only."""
 _MAX_PACKETS_PER_TICK = 1024
 """Largest number of packets that are read in a tick, so that a flood does not stop the loop."""
 _START_ATTEMPTS, _START_WAIT_S = 10, 0.2
 """Number of start requests, of which some may be lost, and time in seconds to wait after each."""
-_MIN_FIRST_RECORDS = 8
+_MIN_RATE_CHECK_RECORDS = 8
 """Number of records by which the rate of a new stream is checked."""
-_MAX_FIRST_SEQUENCE = 1000
+_MAX_NEW_STREAM_SEQUENCE = 1000
 """Sequence number up to which a stream counts as new; that of an older stream is larger."""
-_MAX_CLOCK_DRIFT = 1e-4
+_MAX_RELATIVE_CLOCK_DRIFT = 1e-4
 """Largest relative difference between the rates of the clocks of box and computer."""
-_MAX_AGE_PERIODS = 2.0
+_MAX_RECORD_AGE_PERIODS = 2.0
 """Age of a record, in periods of the loop, above which it counts as stale."""
-_COUNT_NAMES = ("lost", "duplicates", "out_of_order", "malformed", "restarts")
+_ERROR_COUNT_NAMES = ("lost", "duplicates", "out_of_order", "malformed", "restarts")
 """Names of the errors of a stream that are counted."""
 _RECORD_BYTES: Final = protocol.RECORD_LAYOUT.size
 _FRAME_BITS: Final = 8 * (14 + 20 + 8 + _RECORD_BYTES + 4)
@@ -52,26 +52,26 @@ class NetworkLine:
         self._settings = settings
         self._socket: socket.socket | None = None
 
-    def get(self, path: str) -> str:
+    def get_page(self, path: str) -> str:
         """Return the web server's answer to a request for a path, or raise OSError."""
         settings = self._settings
         connection = http.client.HTTPConnection(settings.host, settings.http_port, _PAGE_TIMEOUT_S)
         try:
             connection.request("GET", path)
-            answer = connection.getresponse()
-            content = answer.read(_MAX_PAGE_BYTES)
+            http_response = connection.getresponse()
+            page_bytes = http_response.read(_MAX_PAGE_BYTES)
         except http.client.HTTPException as error:
             raise OSError(str(error)) from error
         finally:
             connection.close()
-        if answer.status not in (200, 302):
-            raise OSError(f"HTTP status {answer.status}")
-        return content.decode("utf-8", errors="replace")
+        if http_response.status not in (200, 302):
+            raise OSError(f"HTTP status {http_response.status}")
+        return page_bytes.decode("utf-8", errors="replace")
 
     def open(self) -> None:
         """Open the socket for requests and records."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
         self._socket.setblocking(False)
         # Connected, the kernel drops packets from elsewhere.
         self._socket.connect((self._settings.host, self._settings.port))
@@ -122,7 +122,7 @@ class NetFtSensor:
 
     def _reset_stream(self) -> None:
         """Reset records, counts and clock for a new stream."""
-        self.counts = dict.fromkeys(_COUNT_NAMES, 0)
+        self.counts = dict.fromkeys(_ERROR_COUNT_NAMES, 0)
         self._record_count = self._status_bits = self._due_ns = 0
         # Rise of the counter since the start, and sequence number before the first record.
         self._counter_rise = self._sequence_before_first = 0
@@ -135,14 +135,14 @@ class NetFtSensor:
     def connect(self) -> None:
         """Read and set the box's settings, start its stream, and check status and rate."""
         try:
-            self._box = configure(self._settings, self._line.get)
+            self._box = configure(self._settings, self._line.get_page)
             self._counter_step = self._box.counter_hz / self._settings.rate_hz
             self._line.open()
-            self._start()
+            self._start_stream()
             self.read_wrench()
         except OSError as error:
             self.close()
-            raise self._error(f"{error}; check address and cable.") from error
+            raise self._box_error(f"{error}; check address and cable.") from error
         except DeviceError:
             self.close()
             raise
@@ -164,7 +164,7 @@ class NetFtSensor:
 
     def read_wrench(self) -> Wrench:
         """Read all records that have arrived; return the newest wrench in N and N·m."""
-        now_ns = self._read()
+        now_ns = self._read_records()
         if not self._newest_packet:
             self.wrench_stale = True
             return self._wrench
@@ -175,13 +175,13 @@ class NetFtSensor:
             kind.saturation_bits | protocol.ANY_ERROR_BIT | protocol.THRESHOLD_BIT
         )
         if fault_bits:
-            texts = "; ".join(kind.status_texts(fault_bits))
-            raise self._error(f"its status {self._status:#010x} reports {texts}.")
+            fault_texts = "; ".join(kind.status_texts(fault_bits))
+            raise self._box_error(f"its status {self._status:#010x} reports {fault_texts}.")
         self.wrench_saturated = self._status & kind.saturation_bits != 0
         fx, fy, fz, tx, ty, tz = map(mul, counts, self._box.units_per_count)
         self._wrench = fx, fy, fz, tx, ty, tz
-        self.wrench_time_ns = self._time_ns(now_ns)
-        self.wrench_stale = now_ns - self.wrench_time_ns > _MAX_AGE_PERIODS * self._period_ns
+        self.wrench_time_ns = self._newest_record_time_ns(now_ns)
+        self.wrench_stale = now_ns - self.wrench_time_ns > _MAX_RECORD_AGE_PERIODS * self._period_ns
         return self._wrench
 
     def health(self) -> LineHealth:
@@ -205,22 +205,24 @@ class NetFtSensor:
 
     def measure(self, duration_s: float) -> dict[str, float]:
         """Read the stream for a time in seconds; return rate, longest gap and numbers of errors."""
-        self._read()
+        self._read_records()
         records, counts_before = self._record_count, self.counts.copy()
         start_s = last_s = now_s = time.monotonic()
-        longest_s = 0.0
+        longest_gap_s = 0.0
         while now_s < start_s + duration_s:
             time.sleep(1e-4)
-            known_count = self._record_count
-            self._read()
+            previous_record_count = self._record_count
+            self._read_records()
             now_s = time.monotonic()
-            if self._record_count > known_count:
-                longest_s, last_s = max(longest_s, now_s - last_s), now_s
+            if self._record_count > previous_record_count:
+                longest_gap_s, last_s = max(longest_gap_s, now_s - last_s), now_s
         rate_hz = (self._record_count - records) / (now_s - start_s)
-        errors = {name: self.counts[name] - counts_before[name] for name in _COUNT_NAMES}
-        return {"records_hz": rate_hz, "longest_gap_s": longest_s, **errors}
+        error_counts = {
+            name: self.counts[name] - counts_before[name] for name in _ERROR_COUNT_NAMES
+        }
+        return {"records_hz": rate_hz, "longest_gap_s": longest_gap_s, **error_counts}
 
-    def _start(self) -> None:
+    def _start_stream(self) -> None:
         """Start the stream, and check that records arrive at the profile's rate."""
         for _ in range(_START_ATTEMPTS):
             self._line.send(protocol.STOP_REQUEST)
@@ -228,27 +230,28 @@ class NetFtSensor:
             self._reset_stream()
             self._line.send(protocol.STREAM_REQUEST)
             deadline_s = time.monotonic() + _START_WAIT_S
-            while self._record_count < _MIN_FIRST_RECORDS and time.monotonic() < deadline_s:
+            while self._record_count < _MIN_RATE_CHECK_RECORDS and time.monotonic() < deadline_s:
                 time.sleep(1e-3)
-                self._read()
-            records = protocol.counter_difference(
+                self._read_records()
+            received_records = protocol.counter_difference(
                 self._last_numbers[0], self._sequence_before_first
             )
-            if records > 1 and self._last_numbers[0] <= _MAX_FIRST_SEQUENCE:
+            if received_records > 1 and self._last_numbers[0] <= _MAX_NEW_STREAM_SEQUENCE:
                 break
         else:
-            raise self._error(
+            raise self._box_error(
                 f"no record came after {_START_ATTEMPTS} requests for its stream. Check that RDT "
                 f"is enabled, and that no firewall drops UDP from its port {self._settings.port}."
             )
-        if abs(self._counter_rise - records * self._counter_step) > 1:
-            raise self._error(
-                f"its counter rises by {self._counter_rise} in {records} records, so it does not "
+        if abs(self._counter_rise - received_records * self._counter_step) > 1:
+            raise self._box_error(
+                f"its counter rises by {self._counter_rise} in {received_records} records, so it "
+                "does not "
                 f"send {self._settings.rate_hz:g} records per second; correct netft.rate_hz or the "
                 "rate in the box."
             )
 
-    def _read(self) -> int:
+    def _read_records(self) -> int:
         """Count the records that have arrived, store the newest, and return the time in ns.
 
         Records of one stream are recognised by the box's counter, which rises by the same step with
@@ -300,10 +303,12 @@ class NetFtSensor:
         self.counts["restarts"] += 1
         self._candidate_sequence = None
         if counter_rise < 0:
-            raise self._error("it has restarted; its bias may have changed. Start a new session.")
+            raise self._box_error(
+                "it has restarted; its bias may have changed. Start a new session."
+            )
         return True
 
-    def _time_ns(self, now_ns: int) -> int:
+    def _newest_record_time_ns(self, now_ns: int) -> int:
         """Return the time in ns, on this computer's clock, at which the newest record was sampled.
 
         The box's counter states it. The offset between the clocks is that of the record with the
@@ -311,10 +316,12 @@ class NetFtSensor:
         the delay is ``sensor.delay_s``.
         """
         box_ns = round(self._counter_rise * 1e9 / self._box.counter_hz)
-        drifted_ns = self._clock_offset_ns + _MAX_CLOCK_DRIFT * (box_ns - self._box_ns)
-        self._box_ns, self._clock_offset_ns = box_ns, min(drifted_ns, now_ns - box_ns)
+        drifted_offset_ns = self._clock_offset_ns + _MAX_RELATIVE_CLOCK_DRIFT * (
+            box_ns - self._box_ns
+        )
+        self._box_ns, self._clock_offset_ns = box_ns, min(drifted_offset_ns, now_ns - box_ns)
         return round(box_ns + self._clock_offset_ns)
 
-    def _error(self, text: str) -> DeviceError:
+    def _box_error(self, reason: str) -> DeviceError:
         """Return an error whose message begins with the name of the box."""
-        return DeviceError(f"{self._settings.box_name}: {text}")
+        return DeviceError(f"{self._settings.box_name}: {reason}")

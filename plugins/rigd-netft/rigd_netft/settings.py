@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, MinLen, doc
 
-from rigd_netft.protocol import PORT, CutOffHz
+from rigd_netft.protocol import RDT_PORT, CutOffHz
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class NetFtSettings:
     counts_per_nm: Annotated[
         float, Ge(0), doc("counts per N·m of a box without web page; 0: read from the page")
     ] = 0.0
-    port: Annotated[int, Ge(1), Le(65535), doc("UDP port of the box")] = PORT
+    port: Annotated[int, Ge(1), Le(65535), doc("UDP port of the box")] = RDT_PORT
     http_port: Annotated[int, Ge(1), Le(65535), doc("port of the web page")] = 80
     faults: Annotated[
         tuple[str, ...], doc("faults of a simulated box, such as loss=0.01 or silence@2")
