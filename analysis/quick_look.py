@@ -20,7 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.estimates import change_between, modes_from_json, unseen_modes
+from rigd.estimates import change_between, modes_from_json, unseen_modes_text
 from rigd.runtime import raise_on_signals
 from rigd.runtime.background import use_one_thread
 from rigd.session import SessionError, Validity
@@ -484,7 +484,7 @@ def _text_lines(quick_look_document: Mapping[str, Any]) -> Iterator[str]:
         if estimate.flag
     )
     yield from (f"  doubtful: {doubt_text}" for doubt_text in doubt_texts)
-    if hidden_modes := unseen_modes(modes):
+    if hidden_modes := unseen_modes_text(modes):
         yield f"  not visible in this record: {hidden_modes}"
     coherence = quick_look_document["coherence"]
     if coherence["mean"] is not None:

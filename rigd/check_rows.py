@@ -51,7 +51,7 @@ class CheckRow:
         }
 
 
-def overall(rows: Iterable[CheckRow]) -> str:
+def overall_verdict(rows: Iterable[CheckRow]) -> str:
     """Return the verdict over all rows: ``failed``, ``warnings`` or ``ok``.
 
     Skipped rows do not count.

@@ -18,13 +18,13 @@ MAX_TOML_BYTES: Final = 250_000
 """Largest size of a TOML file in bytes."""
 MAX_JSON_BYTES: Final = 12_000_000
 """Largest size of a JSON file in bytes; the worst document takes thirty times as much memory."""
-_MAX_ENTRIES: Final = 3000
+_MAX_TOML_ENTRIES: Final = 3000
 """Largest number of keys and elements of a TOML document; a profile has 150."""
-_MAX_LINE_CHARACTERS: Final = 4096
+_MAX_TOML_LINE_CHARACTERS: Final = 4096
 """Largest number of characters in a line of TOML.
 
 The memory for a dotted key grows with the square of its length."""
-_MAX_DEPTH: Final = 16
+_MAX_NESTING_DEPTH: Final = 16
 """Largest depth of nested tables and arrays in a TOML document."""
 
 
@@ -72,9 +72,9 @@ def parse_toml(text: str) -> dict[str, Any]:
     """
     if len(text) > MAX_TOML_BYTES:
         raise DocumentError(f"has more than {MAX_TOML_BYTES} characters; shorten it")
-    if any(len(message_line) > _MAX_LINE_CHARACTERS for message_line in text.splitlines()):
+    if any(len(message_line) > _MAX_TOML_LINE_CHARACTERS for message_line in text.splitlines()):
         raise DocumentError(
-            f"has a line of more than {_MAX_LINE_CHARACTERS} characters; shorten it"
+            f"has a line of more than {_MAX_TOML_LINE_CHARACTERS} characters; shorten it"
         )
     try:
         document = tomllib.loads(text)
@@ -115,17 +115,19 @@ def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN4
 def _require_small_document(document: Mapping[str, Any]) -> None:
     """Raise DocumentError if a document has too many entries or is nested too deeply."""
     entry_count = 0
-    nesting_level: list[Any] = [document]
-    for _ in range(_MAX_DEPTH):
-        nesting_level = [child for parent in nesting_level for child in _children(parent)]
-        entry_count += len(nesting_level)
-        if entry_count > _MAX_ENTRIES:
-            raise DocumentError(f"has more than {_MAX_ENTRIES} keys and numbers; shorten it")
-    if any(_children(child) for child in nesting_level):
-        raise DocumentError(f"has tables nested deeper than {_MAX_DEPTH} levels; flatten it")
+    values_of_level: list[Any] = [document]
+    for _ in range(_MAX_NESTING_DEPTH):
+        values_of_level = [child for parent in values_of_level for child in _child_values(parent)]
+        entry_count += len(values_of_level)
+        if entry_count > _MAX_TOML_ENTRIES:
+            raise DocumentError(f"has more than {_MAX_TOML_ENTRIES} keys and numbers; shorten it")
+    if any(_child_values(child) for child in values_of_level):
+        raise DocumentError(
+            f"has tables nested deeper than {_MAX_NESTING_DEPTH} levels; flatten it"
+        )
 
 
-def _children(value: object) -> list[Any]:
+def _child_values(value: object) -> list[Any]:
     """Return the values in a table or array, or an empty list for any other value."""
     if isinstance(value, dict):
         return [*value.values()]

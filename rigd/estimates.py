@@ -15,10 +15,10 @@ from rigd.units import decimals, finite_number, with_half_width
 ModeSource = Literal["modal", "beam"]
 """Model that provides the numbers of a mode: the modal model, or the beam."""
 
-_SIGNIFICANCE_HALF_WIDTHS: Final = 3.0 / 1.96
+_MIN_SIGNIFICANT_HALF_WIDTHS: Final = 3.0 / 1.96
 """Ratio of three standard deviations to the half-width of a 95 % interval."""
 
-_MAX_MODES: Final = 20
+_MAX_DOCUMENT_MODES: Final = 20
 """Maximum number of modes that are read from a document."""
 _MAX_FLAG_CHARACTERS: Final = 1000
 """Maximum number of characters of a flag that are read from a document."""
@@ -59,19 +59,23 @@ class Estimate:
         """
         return self if flag is None else replace(self, flag=self.flag or flag)
 
-    def percent_above(self, other: "Estimate") -> float:
-        """Return ``100 (self - other) / other`` of the estimates' values; NaN if `other` is 0."""
-        return 100 * (self.value / other.value - 1) if other.value else math.nan
+    def percent_above(self, reference_estimate: "Estimate") -> float:
+        """Return how far this value is above that of another estimate, in percent; NaN if it is 0."""
+        return (
+            100 * (self.value / reference_estimate.value - 1)
+            if reference_estimate.value
+            else math.nan
+        )
 
-    def text(self, scale: float = 1.0) -> str:
+    def text(self, unit_factor: float = 1.0) -> str:
         """Return value and half-width of the 95 % interval as text, without unit.
 
         Parameters
         ----------
-        scale
+        unit_factor
             Factor to the unit of the text, such as 100 for per cent.
         """
-        return with_half_width(self.value, self.interval_95, scale)
+        return with_half_width(self.value, self.interval_95, unit_factor)
 
     def as_json(self) -> dict[str, Any]:
         """Return the estimate as a JSON object."""
@@ -157,7 +161,7 @@ def change_between(earlier: Estimate, later: Estimate) -> Change:
     half_width_95 = math.hypot(
         lower.interval_95[1] - lower.value, higher.value - higher.interval_95[0]
     )
-    return Change(difference, abs(difference) > _SIGNIFICANCE_HALF_WIDTHS * half_width_95 > 0.0)
+    return Change(difference, abs(difference) > _MIN_SIGNIFICANT_HALF_WIDTHS * half_width_95 > 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,8 +231,8 @@ class ReportedMode:
     def frequency_change_text(self, earlier: "ReportedMode") -> str:
         """Return the change of the frequency since an earlier estimate, in Hz with its sign."""
         change_hz = self.frequency_hz.value - earlier.frequency_hz.value
-        decimal_digits = decimals(self.frequency_hz.std) if self.frequency_hz.std else 4
-        return f"{change_hz:+.{decimal_digits}f} Hz"
+        decimal_count = decimals(self.frequency_hz.std) if self.frequency_hz.std else 4
+        return f"{change_hz:+.{decimal_count}f} Hz"
 
     def line(self) -> str:
         """Return one line of text with frequency, damping and inertia.
@@ -240,13 +244,13 @@ class ReportedMode:
         >>> print(ReportedMode(1, frequency_hz, Estimate(0.00909, None, None)).line())
         mode 1: 2.5699 ± 0.0012 Hz, damping 0.909 %
         """
-        text = (
+        mode_text = (
             f"mode {self.number}: {self.frequency_hz.text()} Hz, "
             f"damping {self.damping_ratio.text(100.0)} %"
         )
         if self.participation is None:
-            return text
-        return f"{text}, inertia {self.participation.text(_KG_MM2_PER_KG_M2)} kg·mm²"
+            return mode_text
+        return f"{mode_text}, inertia {self.participation.text(_KG_MM2_PER_KG_M2)} kg·mm²"
 
 
 def modes_from_json(documents: object) -> list[ReportedMode]:
@@ -257,10 +261,10 @@ def modes_from_json(documents: object) -> list[ReportedMode]:
     documents
         Value of the key ``modes`` of a document from any source.
     """
-    return list(_modes(documents)) if isinstance(documents, list) else []
+    return list(_iterate_modes(documents)) if isinstance(documents, list) else []
 
 
-def unseen_modes(modes: Iterable[ReportedMode]) -> str:
+def unseen_modes_text(modes: Iterable[ReportedMode]) -> str:
     """Return text that names the modes that are not visible in a record; empty if all are.
 
     Parameters
@@ -270,17 +274,19 @@ def unseen_modes(modes: Iterable[ReportedMode]) -> str:
 
     Examples
     --------
-    >>> from rigd.estimates import Estimate, ReportedMode, unseen_modes
+    >>> from rigd.estimates import Estimate, ReportedMode, unseen_modes_text
     >>> one = Estimate(1.0, None, None)
-    >>> unseen_modes(ReportedMode(n, one, one, shown=n == 1) for n in (1, 2, 3))
+    >>> unseen_modes_text(ReportedMode(n, one, one, shown=n == 1) for n in (1, 2, 3))
     'modes 2 and 3'
     """
-    numbers = [str(mode.number) for mode in modes if not mode.shown]
-    return f"mode{'s' if len(numbers) > 1 else ''} {listed(numbers)}" if numbers else ""
+    mode_numbers = [str(mode.number) for mode in modes if not mode.shown]
+    return (
+        f"mode{'s' if len(mode_numbers) > 1 else ''} {listed(mode_numbers)}" if mode_numbers else ""
+    )
 
 
-def _modes(documents: list[object]) -> Iterator[ReportedMode]:
+def _iterate_modes(documents: list[object]) -> Iterator[ReportedMode]:
     """Yield the entries of a JSON list that are modes."""
-    for number, document in enumerate(documents[:_MAX_MODES], start=1):
+    for number, document in enumerate(documents[:_MAX_DOCUMENT_MODES], start=1):
         if (mode := ReportedMode.from_json(document, number)) is not None:
             yield mode

@@ -17,7 +17,7 @@ WARNING_FRACTION: Final = 0.8
 """Fraction of a limit above which a gauge turns orange, as for the interlocks' warnings."""
 
 
-UNITS: Final = {
+GAUGE_UNITS: Final = {
     "angle": "rad",
     "velocity": "rad/s",
     "tracking_error": "rad",
@@ -62,7 +62,8 @@ class Gauges:
     rate_hz
         Scheduled ticks per second.
     limits
-        Limits by the names of ``UNITS``. A signal with an absent or infinite limit has no limit.
+        Limits by the names of ``GAUGE_UNITS``. A signal with an absent or infinite limit has no
+        limit.
     thermal_time_constant_s
         Time constant of the filter that averages the squared torque.
     """
@@ -75,13 +76,13 @@ class Gauges:
             name: signal_limit for name, signal_limit in limits.items() if isfinite(signal_limit)
         }
         self._time_constant_s = thermal_time_constant_s
-        self._heat_nm2 = 0.0
+        self._mean_squared_torque_nm2 = 0.0
         self._last_fresh_angle: tuple[int, float] | None = (
             None  # tick and angle of the last fresh reading
         )
 
-    def take(self, samples: Records) -> dict[str, Gauge]:
-        """Return the largest magnitudes in a block of samples, by the names of ``UNITS``.
+    def gauges_of_block(self, samples: Records) -> dict[str, Gauge]:
+        """Return the largest magnitudes in a block of samples, by the names of ``GAUGE_UNITS``.
 
         Parameters
         ----------
@@ -90,31 +91,35 @@ class Gauges:
         """
         torque_nm = samples["torque_command_nm"]
         largest_magnitudes = {
-            "angle": _peak(samples["angle_rad"]),
-            "velocity": _peak(self._speeds_from_fresh_angles(samples)),
-            "tracking_error": _peak(samples["angle_reference_rad"] - samples["angle_rad"]),
-            "torque_command": _peak(torque_nm),
+            "angle": _largest_magnitude(samples["angle_rad"]),
+            "velocity": _largest_magnitude(self._speeds_from_fresh_angles(samples)),
+            "tracking_error": _largest_magnitude(
+                samples["angle_reference_rad"] - samples["angle_rad"]
+            ),
+            "torque_command": _largest_magnitude(torque_nm),
             "i2t": self._update_rms_torque(torque_nm),
         } | {
-            wrench_field.partition("_")[0]: _peak(samples[wrench_field])
+            wrench_field.partition("_")[0]: _largest_magnitude(samples[wrench_field])
             for wrench_field in WRENCH_FIELDS
         }
         return self.with_limits(largest_magnitudes)
 
-    def with_limits(self, magnitudes: Mapping[str, float | None]) -> dict[str, Gauge]:
+    def with_limits(self, magnitudes_by_signal: Mapping[str, float | None]) -> dict[str, Gauge]:
         """Return gauges with the given magnitudes and this session's limits, by signal name.
 
         Parameters
         ----------
-        magnitudes
+        magnitudes_by_signal
             Magnitudes by signal name. A signal that is absent has an unknown magnitude.
         """
         return {
-            signal_name: Gauge(magnitudes.get(signal_name), self._limits.get(signal_name), unit)
-            for signal_name, unit in UNITS.items()
+            signal_name: Gauge(
+                magnitudes_by_signal.get(signal_name), self._limits.get(signal_name), unit
+            )
+            for signal_name, unit in GAUGE_UNITS.items()
         }
 
-    def cool(self, duration_s: float) -> float:
+    def cool_down(self, duration_s: float) -> float:
         """Return the rms torque (i²t) in N·m after `duration_s` without torque.
 
         Parameters
@@ -122,8 +127,8 @@ class Gauges:
         duration_s
             Time during which the motor had no torque.
         """
-        self._heat_nm2 *= exp(-duration_s / self._time_constant_s)
-        return sqrt(self._heat_nm2)
+        self._mean_squared_torque_nm2 *= exp(-duration_s / self._time_constant_s)
+        return sqrt(self._mean_squared_torque_nm2)
 
     def forget_angle(self) -> None:
         """Forget the last motor angle, so that no speed is computed from angles of two records."""
@@ -150,12 +155,14 @@ class Gauges:
         """Update the rms torque (i²t) with commanded torques and return it in N·m."""
         known_torque_nm = torque_nm[np.isfinite(torque_nm)]
         time_constant_ticks = self._rate_hz * self._time_constant_s
-        self._heat_nm2 *= exp(-torque_nm.size / time_constant_ticks)
-        self._heat_nm2 += float(known_torque_nm @ known_torque_nm) / time_constant_ticks
-        return sqrt(self._heat_nm2)
+        self._mean_squared_torque_nm2 *= exp(-torque_nm.size / time_constant_ticks)
+        self._mean_squared_torque_nm2 += (
+            float(known_torque_nm @ known_torque_nm) / time_constant_ticks
+        )
+        return sqrt(self._mean_squared_torque_nm2)
 
 
-def _peak(signal_values: npt.NDArray[np.float64]) -> float | None:
+def _largest_magnitude(signal_values: npt.NDArray[np.float64]) -> float | None:
     """Return the largest magnitude of the finite values; None if there are none."""
     finite_values = signal_values[np.isfinite(signal_values)]
     return float(np.abs(finite_values).max()) if finite_values.size else None

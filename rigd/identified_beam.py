@@ -27,9 +27,9 @@ from rigd.estimates import Estimate, ReportedMode
 from rigd.session import BeamUniformity
 from rigd.units import is_usable_size
 
-_HALF_WIDTH_95_STDS: Final = 1.959964
+_INTERVAL_95_HALF_WIDTH_STDS: Final = 1.959964
 """Half-width of the two-sided 95 % interval of a normal distribution, in standard deviations."""
-_ADVICE: Final = "write it with analyze session.mcap --json model.json"
+_WRITE_DOCUMENT_ADVICE: Final = "write it with analyze session.mcap --json model.json"
 """Advice in messages about unusable documents."""
 
 
@@ -37,7 +37,7 @@ _FILTER_ADVICE: Final = (  # Advice if the analysis found a low-pass filter
     "state it in the profile (sensor.filter_hz = {corner_hz:.4g}, sensor.filter_order = {order}), "
     "record again and analyze that session"
 )
-_EFFECTS: Final[Mapping[str, tuple[str, str]]] = {
+_EFFECTS_BY_PARAMETER: Final[Mapping[str, tuple[str, str]]] = {
     "tip_mass_kg": ("a mass at the tip", "take it off, and record and analyze again"),
     "root_compliance_rad_per_nm": (
         "an elastic clamp",
@@ -82,30 +82,30 @@ class IdentifiedBeamError(UserError, ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Use:
+class BeamUse:
     """Purpose for which an identified beam is used, with its requirements on the document."""
 
     name: str
     """Name of the purpose in messages, such as "a move"."""
-    effects: frozenset[str]
+    included_effects: frozenset[str]
     """Parameters of effects beyond a uniform beam that are taken into account."""
-    certain: frozenset[str]
+    required_parameters: frozenset[str]
     """Parameters that must not be flagged, unless their standard deviation covers the doubt."""
-    modes: bool = False
+    allows_observed_modes: bool = False
     """Whether observed modes can replace those of a uniform beam, with one stiffness per mode."""
 
 
-MOVE: Final = Use(
+MOVE: Final = BeamUse(
     "a move",
     frozenset({"tip_mass_kg", "root_compliance_rad_per_nm", OFFSET_PREFIX}),
     frozenset({*BEAM_PARAMETERS, "tip_mass_kg", "root_compliance_rad_per_nm", OFFSET_PREFIX}),
-    modes=True,
+    allows_observed_modes=True,
 )
 """Use of a beam for a vibration-free move.
 
 The move depends on the modes and hardly on the composition of their damping."""
 
-TOUCH: Final = Use(
+TOUCH: Final = BeamUse(
     "a search for touches",
     frozenset(),
     frozenset(BEAM_PARAMETERS),
@@ -122,7 +122,7 @@ class IdentifiedBeam:
     plant: Plant
     """Plant with the given length and the identified parameters. A damping coefficient of 0 means
     that the structure has no such damping."""
-    std: Mapping[str, float]
+    parameter_stds: Mapping[str, float]
     """Known standard deviations of parameters, by their names in the document."""
     mode_uncertainty: tuple[float, ...] = ()
     """Relative standard uncertainty of the pole of each mode in the document."""
@@ -137,13 +137,17 @@ class IdentifiedBeam:
             largest uncertainty of the modes in the document.
         """
         density_uncertainty = (
-            0.5 * self.std.get(BEAM_PARAMETERS[0], 0.0) / self.plant.beam.density_over_stiffness
+            0.5
+            * self.parameter_stds.get(BEAM_PARAMETERS[0], 0.0)
+            / self.plant.beam.density_over_stiffness
         )
         largest_uncertainty = max(self.mode_uncertainty, default=density_uncertainty)
         return (*self.mode_uncertainty, *(largest_uncertainty,) * mode_count)[:mode_count]
 
 
-def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> IdentifiedBeam:
+def read_identified_beam(
+    document_path: str | Path, stated_plant: Plant, use: BeamUse
+) -> IdentifiedBeam:
     """Read the identified beam from the document of an analysis or a campaign.
 
     The beam is that of the first headline, or of a campaign's pooled headline. If a uniform beam
@@ -156,7 +160,7 @@ def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> 
     document_path
         Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
         ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
-    stated
+    stated_plant
         Plant with the stated length, which no session determines, and with the delay and the tool
         inertia to use if the document has none.
     use
@@ -173,18 +177,19 @@ def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> 
         If the file cannot be read or lacks parameters, if it has an effect or a finding that this
         use does not take into account, or if a required number is flagged.
     """
-    label, headline, refusal = _read_headline(Path(document_path))
-    if refusal and not use.modes:
+    headline_label, headline, refusal = _read_headline(Path(document_path))
+    if refusal and not use.allows_observed_modes:
         raise IdentifiedBeamError(
-            f"{label}.validity.uniform_beam: {refusal}, and {use.name} relies on a uniform beam; "
+            f"{headline_label}.validity.uniform_beam: {refusal}, and {use.name} relies on a "
+            "uniform beam; "
             "remove what makes it differ (a mass, a soft clamp, an axis that is not plumb), and "
             "record and analyze again, or leave out --model."
         )
-    _require_known_findings(label, headline.get("named"), use)
+    _require_known_findings(headline_label, headline.get("named"), use)
     exact_geometry = headline.get("exact_geometry")
     if not refusal and isinstance(exact_geometry, dict):
-        label, headline = f"{label}.exact_geometry", exact_geometry
-    estimates = parameter_estimates(label, headline.get("parameters"))
+        headline_label, headline = f"{headline_label}.exact_geometry", exact_geometry
+    estimates = parameter_estimates(headline_label, headline.get("parameters"))
     if refusal:
         # Effective values of a uniform beam do not describe the rig: the modes replace them.
         estimates = {
@@ -192,59 +197,69 @@ def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> 
             for name, estimate in estimates.items()
             if _effect_key(name) not in (OFFSET_PREFIX, *END_PARAMETERS)
         }
-    values = {name: estimate.value for name, estimate in estimates.items()}
-    _require_known_effects(label, values, use)
+    parameter_values = {name: estimate.value for name, estimate in estimates.items()}
+    _require_known_effects(headline_label, parameter_values, use)
     if not refusal:
-        _require_certain(label, estimates, use)
-    _check_offset_modes(label, values)
+        _require_unflagged_parameters(headline_label, estimates, use)
+    _check_offset_modes(headline_label, parameter_values)
     plant_values = {
         name: value
-        for name, value in values.items()
-        if (effect_key := _effect_key(name)) not in _EFFECTS or effect_key in use.effects
+        for name, value in parameter_values.items()
+        if (effect_key := _effect_key(name)) not in _EFFECTS_BY_PARAMETER
+        or effect_key in use.included_effects
     }
-    channel_values = {name: getattr(stated, name) for name in ("delay_s", "tool_inertia_kg_m2")}
+    channel_values = {
+        name: getattr(stated_plant, name) for name in ("delay_s", "tool_inertia_kg_m2")
+    }
     identified_beam = IdentifiedBeam(
-        Plant.from_parameters(stated.beam.length_m, channel_values | plant_values),
+        Plant.from_parameters(stated_plant.beam.length_m, channel_values | plant_values),
         {
             name: std
             for name, estimate in estimates.items()
             if (std := _standard_deviation(estimate)) is not None
         },
-        tuple(_mode_uncertainties(label, headline.get("modes"))),
+        tuple(_mode_uncertainties(headline_label, headline.get("modes"))),
     )
     return (
-        _with_observed_modes(label, identified_beam, headline.get("modes"), refusal)
+        _with_observed_modes(headline_label, identified_beam, headline.get("modes"), refusal)
         if refusal
         else identified_beam
     )
 
 
 def _with_observed_modes(
-    label: str, identified_beam: IdentifiedBeam, documents: object, refusal: str
+    headline_label: str, identified_beam: IdentifiedBeam, mode_documents: object, refusal: str
 ) -> IdentifiedBeam:
     """Return the beam after its modes are replaced by the observed ones.
 
     Stiffness offsets give it the observed frequencies, and its inertia follows from the first
     mode's participation. `refusal` is the reason why no uniform beam can be used.
     """
-    modes: list[ReportedMode] = []
-    for number, document in enumerate(documents if isinstance(documents, list) else [], start=1):
+    observed_modes: list[ReportedMode] = []
+    for number, document in enumerate(
+        mode_documents if isinstance(mode_documents, list) else [], start=1
+    ):
         mode = ReportedMode.from_json(document, number)
         if mode is None or not mode.shown or not mode.damping_ratio.value or mode.flag:
             break
         if mode.participation is not None and mode.participation.flag:
             break
-        modes.append(mode)
-    if not modes:
+        observed_modes.append(mode)
+    if not observed_modes:
         raise IdentifiedBeamError(
-            f"{label}.modes: {refusal}, and no mode is shown without a flag that could take its "
+            f"{headline_label}.modes: {refusal}, and no mode is shown without a flag that could "
+            "take its "
             "place; record a session that shows more modes and analyze it, or leave out --model."
         )
     try:
-        plant = identified_beam.plant.with_frequencies([mode.frequency_hz.value for mode in modes])
+        plant = identified_beam.plant.with_frequencies(
+            [mode.frequency_hz.value for mode in observed_modes]
+        )
     except ValueError as error:
-        raise IdentifiedBeamError(f"{label}.parameters: {error} Leave out --model.") from None
-    beam, mode_inertia = plant.beam, modes[0].participation
+        raise IdentifiedBeamError(
+            f"{headline_label}.parameters: {error} Leave out --model."
+        ) from None
+    beam, mode_inertia = plant.beam, observed_modes[0].participation
     if mode_inertia is not None and mode_inertia.value > 0:
         mass_scale = mode_inertia.value / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
         beam = replace(
@@ -253,11 +268,13 @@ def _with_observed_modes(
             bending_stiffness_n_m2=mass_scale * beam.bending_stiffness_n_m2,
         )
         plant = replace(plant, beam=beam)
-    poles = plant.poles(clamped_free_eigenvalues(len(modes)))[:, 0]
+    poles = plant.poles(clamped_free_eigenvalues(len(observed_modes)))[:, 0]
     # The difference between the damping of the beam and of the modes counts as uncertainty.
     pole_uncertainties = (
         hypot(std, abs(mode.damping_ratio.value + pole.real / abs(pole)))
-        for std, mode, pole in zip(identified_beam.mode_uncertainty, modes, poles, strict=False)
+        for std, mode, pole in zip(
+            identified_beam.mode_uncertainty, observed_modes, poles, strict=False
+        )
     )
     return replace(identified_beam, plant=plant, mode_uncertainty=tuple(pole_uncertainties))
 
@@ -268,12 +285,16 @@ def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
     The reason is "" if a uniform beam can be used.
     """
     document: Any = read_document(path)
-    label, headline = select_headline(path, document)
+    headline_label, headline = select_headline(path, document)
     # A single record of a campaign can exclude a uniform beam.
     is_pooled = headline.get("file", "") is None
     headlines = document["headlines"] if is_pooled else [headline]
-    refusals = [_uniform_beam_refusal(path, each) for each in headlines if isinstance(each, dict)]
-    return label, headline, next(filter(None, refusals), "")
+    uniform_beam_refusals = [
+        _uniform_beam_refusal(path, stated_headline)
+        for stated_headline in headlines
+        if isinstance(stated_headline, dict)
+    ]
+    return headline_label, headline, next(filter(None, uniform_beam_refusals), "")
 
 
 def read_document(path: Path) -> object:
@@ -292,7 +313,7 @@ def read_document(path: Path) -> object:
     try:
         return read_json(path)
     except DocumentError as error:
-        raise IdentifiedBeamError(f"{path}: {error}; {_ADVICE}.") from error
+        raise IdentifiedBeamError(f"{path}: {error}; {_WRITE_DOCUMENT_ADVICE}.") from error
 
 
 def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any]]:
@@ -319,24 +340,26 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
         if isinstance(headline, dict)
     ]
     headline_index, headline = min(  # the pooled one, else the first
-        numbered_headlines, key=_is_of_one_file, default=(0, {})
+        numbered_headlines, key=_is_of_single_file, default=(0, {})
     )
     if not isinstance(headline.get("parameters"), dict):
-        raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_ADVICE}.")
+        raise IdentifiedBeamError(
+            f"{path}: has no headlines[0].parameters; {_WRITE_DOCUMENT_ADVICE}."
+        )
     return f"{path}: headlines[{headline_index}]", headline
 
 
-def _is_of_one_file(numbered_headline: tuple[int, Mapping[str, Any]]) -> bool:
+def _is_of_single_file(numbered_headline: tuple[int, Mapping[str, Any]]) -> bool:
     """Return whether a headline is of a single file, and not of all files together."""
     return numbered_headline[1].get("file", "") is not None
 
 
-def uniform_beam_test(label: str, headline: Mapping[str, Any]) -> BeamUniformity:
+def uniform_beam_test(headline_label: str, headline: Mapping[str, Any]) -> BeamUniformity:
     """Return the result of a headline's test whether a uniform beam predicts the modes.
 
     Parameters
     ----------
-    label
+    headline_label
         Name of the headline, or of its file, in messages.
     headline
         Headline of an analysis.
@@ -350,33 +373,35 @@ def uniform_beam_test(label: str, headline: Mapping[str, Any]) -> BeamUniformity
     stated_test = validity.get("uniform_beam") if isinstance(validity, dict) else None
     if stated_test is None:
         return BeamUniformity("not tested")
-    test = BeamUniformity.from_document(stated_test)
-    if test is None:
+    uniformity_test = BeamUniformity.from_document(stated_test)
+    if uniformity_test is None:
         raise IdentifiedBeamError(
-            f"{label}: validity.uniform_beam = {json.dumps(stated_test, default=str)[:60]} of a "
-            f"headline is not the result of a test; {_ADVICE}."
+            f"{headline_label}: validity.uniform_beam = "
+            f"{json.dumps(stated_test, default=str)[:60]} of a "
+            f"headline is not the result of a test; {_WRITE_DOCUMENT_ADVICE}."
         )
-    return test
+    return uniformity_test
 
 
 def _uniform_beam_refusal(path: Path, headline: Mapping[str, Any]) -> str:
     """Return why a uniform beam does not predict the modes of a record, or "" if it may."""
-    test = uniform_beam_test(str(path), headline)
-    if test.status != "refused":
+    uniformity_test = uniform_beam_test(str(path), headline)
+    if uniformity_test.status != "refused":
         return ""
     return (
-        f"a uniform beam does not predict the modes that the record shows (p = {test.p_value:.1g})"
+        "a uniform beam does not predict the modes that the record shows (p = "
+        f"{uniformity_test.p_value:.1g})"
     )
 
 
-def parameter_estimates(label: str, documents: object) -> dict[str, Estimate]:
+def parameter_estimates(headline_label: str, parameter_documents: object) -> dict[str, Estimate]:
     """Return the estimates of a headline's parameters by name, after a check of their ranges.
 
     Parameters
     ----------
-    label
+    headline_label
         Name of the headline in messages.
-    documents
+    parameter_documents
         Value of the key ``parameters`` of the headline.
 
     Raises
@@ -384,19 +409,24 @@ def parameter_estimates(label: str, documents: object) -> dict[str, Estimate]:
     IdentifiedBeamError
         If a parameter is unknown or out of range, or a required parameter is missing.
     """
-    if not isinstance(documents, dict):
-        raise IdentifiedBeamError(f"{label}.parameters is missing; {_ADVICE}.")
-    estimates = {name: _estimate(label, name, document) for name, document in documents.items()}
+    if not isinstance(parameter_documents, dict):
+        raise IdentifiedBeamError(
+            f"{headline_label}.parameters is missing; {_WRITE_DOCUMENT_ADVICE}."
+        )
+    estimates = {
+        name: _parameter_estimate(headline_label, name, document)
+        for name, document in parameter_documents.items()
+    }
     for name in BEAM_PARAMETERS:
         if name not in estimates:
             raise IdentifiedBeamError(
-                f"{label}.parameters.{name} is missing; take the document of an analysis that "
-                "found it (analyze session.mcap --json model.json)."
+                f"{headline_label}.parameters.{name} is missing; take the document of an "
+                "analysis that found it (analyze session.mcap --json model.json)."
             )
     return estimates
 
 
-def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
+def findings_without_parameter(named_findings: object) -> list[tuple[int, str, str]]:
     """Return the findings of an analysis whose effect no parameter describes.
 
     Each one is a tuple of index, kind and sentence. Findings that concern only the record and not
@@ -404,12 +434,12 @@ def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
 
     Parameters
     ----------
-    named
+    named_findings
         List ``named`` of a headline.
     """
     findings = (
         (index, finding if isinstance(finding, dict) else {})
-        for index, finding in enumerate(named if isinstance(named, list) else [])
+        for index, finding in enumerate(named_findings if isinstance(named_findings, list) else [])
     )
     return [
         (index, kind[:60], str(finding.get("sentence"))[:200])
@@ -424,32 +454,44 @@ def _effect_key(parameter_name: str) -> str:
     return OFFSET_PREFIX if parameter_name.startswith(OFFSET_PREFIX) else parameter_name
 
 
-def _estimate(label: str, name: str, document: object) -> Estimate:
+def _parameter_estimate(headline_label: str, parameter_name: str, document: object) -> Estimate:
     """Return the estimate of a parameter, or raise if it is unknown or outside its range."""
     try:
-        definition = parameter_named(name)
+        parameter_definition = parameter_named(parameter_name)
     except KeyError:
         raise IdentifiedBeamError(
-            f"{label}.parameters.{name[:60]!r} is not known to this version, so what it changes "
+            f"{headline_label}.parameters.{parameter_name[:60]!r} is not known to this version, "
+            "so what it changes "
             "cannot be taken into account; update rigd, or do without this document."
         ) from None
     estimate = Estimate.from_json(document)
-    if estimate and definition.is_valid(estimate.value) and is_usable_size(estimate.value):
+    if (
+        estimate
+        and parameter_definition.is_valid(estimate.value)
+        and is_usable_size(estimate.value)
+    ):
         return estimate
     stated_value = document.get("value") if isinstance(document, dict) else None
     raise IdentifiedBeamError(
-        f"{label}.parameters.{name}.value = {json.dumps(stated_value, default=str)[:60]} "
-        f"must be a number of {definition.range_text}; {_ADVICE}."
+        f"{headline_label}.parameters.{parameter_name}.value = "
+        f"{json.dumps(stated_value, default=str)[:60]} "
+        f"must be a number of {parameter_definition.range_text}; {_WRITE_DOCUMENT_ADVICE}."
     )
 
 
-def _require_known_effects(label: str, values_by_name: Mapping[str, float], use: Use) -> None:
+def _require_known_effects(
+    headline_label: str, values_by_name: Mapping[str, float], use: BeamUse
+) -> None:
     """Raise IdentifiedBeamError if the analysis found an effect that the use cannot include."""
     for parameter_name, parameter_value in values_by_name.items():
         effect_key = _effect_key(parameter_name)
-        if not parameter_value or effect_key not in _EFFECTS or effect_key in use.effects:
+        if (
+            not parameter_value
+            or effect_key not in _EFFECTS_BY_PARAMETER
+            or effect_key in use.included_effects
+        ):
             continue
-        description, remedy = _EFFECTS[effect_key]
+        description, remedy = _EFFECTS_BY_PARAMETER[effect_key]
         corner_hz = 0.0 if "filter" not in parameter_name else 1.0 / (2.0 * pi * parameter_value)
         remedy_text = remedy.format(
             corner_hz=corner_hz, order=2 if parameter_name.startswith("second") else 1
@@ -457,7 +499,8 @@ def _require_known_effects(label: str, values_by_name: Mapping[str, float], use:
         unit = parameter_named(parameter_name).unit
         unit_text = f" {unit}" if unit else ""
         raise IdentifiedBeamError(
-            f"{label}.parameters.{parameter_name}.value = {parameter_value:.4g}{unit_text}: "
+            f"{headline_label}.parameters.{parameter_name}.value = "
+            f"{parameter_value:.4g}{unit_text}: "
             f"the analysis found {description}, which {use.name} does not take into account; "
             f"{remedy_text}."
         )
@@ -465,30 +508,35 @@ def _require_known_effects(label: str, values_by_name: Mapping[str, float], use:
         values_by_name[n] for n in values_by_name if n.startswith(OFFSET_PREFIX)
     ):
         raise IdentifiedBeamError(
-            f"{label}.parameters: tip_mass_kg and {OFFSET_PREFIX}… together are not defined; use "
-            "the JSON of an analysis that found one of them."
+            f"{headline_label}.parameters: tip_mass_kg and {OFFSET_PREFIX}… together are not "
+            "defined; use the JSON of an analysis that found one of them."
         )
 
 
-def _require_known_findings(label: str, named: object, use: Use) -> None:
+def _require_known_findings(headline_label: str, named_findings: object, use: BeamUse) -> None:
     """Raise IdentifiedBeamError if no parameter describes a finding of the analysis."""
-    for finding_index, finding_kind, sentence in findings_without_parameter(named):
+    for finding_index, finding_kind, sentence in findings_without_parameter(named_findings):
         raise IdentifiedBeamError(
-            f"{label}.named[{finding_index}]: {finding_kind}, which {use.name} does not take into "
-            f"account ({sentence}); remove its cause, and record and analyze again, or "
+            f"{headline_label}.named[{finding_index}]: {finding_kind}, which {use.name} does not "
+            f"take into account ({sentence}); remove its cause, and record and analyze again, or "
             "leave out --model."
         )
 
 
-def _require_certain(label: str, estimates: Mapping[str, Estimate], use: Use) -> None:
+def _require_unflagged_parameters(
+    headline_label: str, estimates: Mapping[str, Estimate], use: BeamUse
+) -> None:
     """Raise IdentifiedBeamError if a parameter is flagged on which the use relies."""
     for name, estimate in estimates.items():
         # For a move the uncertainty of the modes includes the damping.
-        covered_by_modes = use is MOVE and _effect_key(name) not in _EFFECTS
+        covered_by_modes = use is MOVE and _effect_key(name) not in _EFFECTS_BY_PARAMETER
         is_covered = covered_by_modes or _standard_deviation(estimate) is not None
-        if estimate.flag is not None and (_effect_key(name) in use.certain or not is_covered):
+        if estimate.flag is not None and (
+            _effect_key(name) in use.required_parameters or not is_covered
+        ):
             raise IdentifiedBeamError(
-                f"{label}.parameters.{name} is flagged ({estimate.flag[:100]}), and {use.name} "
+                f"{headline_label}.parameters.{name} is flagged ({estimate.flag[:100]}), and "
+                f"{use.name} "
                 "relies on it; record a session that shows more modes or is longer and analyze it, "
                 "or leave out --model."
             )
@@ -501,31 +549,33 @@ def _standard_deviation(estimate: Estimate) -> float | None:
     """
     if estimate.interval_95 is not None:
         low, high = estimate.interval_95
-        return abs(high - low) / (2 * _HALF_WIDTH_95_STDS)
+        return abs(high - low) / (2 * _INTERVAL_95_HALF_WIDTH_STDS)
     return estimate.std if estimate.std is not None and estimate.std > 0 else None
 
 
-def _check_offset_modes(label: str, values_by_name: Mapping[str, float]) -> None:
+def _check_offset_modes(headline_label: str, values_by_name: Mapping[str, float]) -> None:
     """Raise IdentifiedBeamError if the stiffness offsets are not those of modes 2, 3 etc."""
-    given_modes = sorted(
+    offset_mode_numbers = sorted(
         int(n.removeprefix(OFFSET_PREFIX)) for n in values_by_name if n.startswith(OFFSET_PREFIX)
     )
-    if given_modes != list(range(2, 2 + len(given_modes))):
+    if offset_mode_numbers != list(range(2, 2 + len(offset_mode_numbers))):
         raise IdentifiedBeamError(
-            f"{label}.parameters: {OFFSET_PREFIX}… are those of modes "
-            f"{', '.join(map(str, given_modes))}, but must be those of modes 2 to "
-            f"{1 + len(given_modes)}; {_ADVICE}."
+            f"{headline_label}.parameters: {OFFSET_PREFIX}… are those of modes "
+            f"{', '.join(map(str, offset_mode_numbers))}, but must be those of modes 2 to "
+            f"{1 + len(offset_mode_numbers)}; {_WRITE_DOCUMENT_ADVICE}."
         )
 
 
-def _mode_uncertainties(label: str, documents: object) -> Iterator[float]:
+def _mode_uncertainties(headline_label: str, mode_documents: object) -> Iterator[float]:
     """Yield the relative standard uncertainty of the pole of each mode in the document."""
-    for number, document in enumerate(documents if isinstance(documents, list) else [], start=1):
+    for number, document in enumerate(
+        mode_documents if isinstance(mode_documents, list) else [], start=1
+    ):
         mode = ReportedMode.from_json(document, 0)
         if mode is None or mode.number != number:
             raise IdentifiedBeamError(
-                f"{label}.modes[{number - 1}] is not mode {number} with frequency_hz and "
-                f"damping_ratio; {_ADVICE}."
+                f"{headline_label}.modes[{number - 1}] is not mode {number} with frequency_hz and "
+                f"damping_ratio; {_WRITE_DOCUMENT_ADVICE}."
             )
         yield hypot(
             (_standard_deviation(mode.frequency_hz) or 0.0) / mode.frequency_hz.value,

@@ -162,10 +162,12 @@ def test_a_flagged_number_is_refused(analysed):
 
 def test_touch_uses_the_deviation_of_a_flagged_damping(analysed):
     path = analysed(gamma=flagged(0.05, interval_95=[0.03, 0.07]))
-    assert read_identified_beam(path, STATED, TOUCH).std["gamma"] == pytest.approx(0.0102, 1e-2)
+    assert read_identified_beam(path, STATED, TOUCH).parameter_stds["gamma"] == pytest.approx(
+        0.0102, 1e-2
+    )
     path = analysed(gamma={"value": 0.05, "std": None, "flag": "not identifiable"})
     assert "gamma is flagged" in refusal(path, TOUCH)
-    assert "gamma" not in read_identified_beam(path, STATED, MOVE).std
+    assert "gamma" not in read_identified_beam(path, STATED, MOVE).parameter_stds
 
 
 def test_the_uncertainty_of_the_poles_is_that_of_the_modes(analysed):

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from math import isfinite
 
-from rigd.check_rows import CheckResult, CheckRow, overall
+from rigd.check_rows import CheckResult, CheckRow, overall_verdict
 from rigd.units import UNITS, suffix_of
 
 # Values and their units
@@ -141,5 +141,5 @@ def _verdict_line(check_rows: Sequence[CheckRow], consequence_by_verdict: Mappin
         f"ok: {row_count_by_verdict[CheckResult.OK]}, skipped: "
         f"{row_count_by_verdict[CheckResult.SKIPPED]}"
     )
-    verdict = overall(check_rows)
+    verdict = overall_verdict(check_rows)
     return f"Verdict: {verdict} ({row_counts_text}): {consequence_by_verdict[verdict]}."

@@ -71,9 +71,9 @@ def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, is_eds_only: b
 
     `is_eds_only` states that only an EDS file was checked.
     """
-    from rigd.check_rows import overall
+    from rigd.check_rows import overall_verdict
 
-    verdict = overall(check_rows)
+    verdict = overall_verdict(check_rows)
     if as_json:
         json_document = {"verdict": verdict, "rows": [row.as_dict() for row in check_rows]}
         typer.echo(json.dumps(json_document, ensure_ascii=False))

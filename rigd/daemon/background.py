@@ -99,7 +99,7 @@ class CheckJob:
 
     def perform(self) -> dict[str, Any]:
         """Return the results of all checks and the verdict as a dictionary for JSON."""
-        from rigd.check_rows import overall
+        from rigd.check_rows import overall_verdict
         from rigd.checks import check_without_devices
 
         check_rows = check_without_devices(self.profile, self.calibration)
@@ -114,7 +114,7 @@ class CheckJob:
                 }
                 for row in check_rows
             ],
-            "verdict": overall(check_rows),
+            "verdict": overall_verdict(check_rows),
         }
 
 

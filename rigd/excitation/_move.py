@@ -17,7 +17,7 @@ from rigd.excitation._signals import (
     require_finite,
     require_within_turn,
 )
-from rigd.identified_beam import MOVE, Use
+from rigd.identified_beam import MOVE, BeamUse
 
 _MAX_END_ANGLE_FRACTION: Final = 0.98
 """Largest fraction of the angle limit at which a move may end; the remainder is for overshoot."""
@@ -32,7 +32,7 @@ class MoveRig(Protocol):
     def start_rad(self) -> float:
         """Present angle of the motor from the rig's zero, in rad."""
 
-    def move_plant(self, path: str | Path, use: Use) -> MovePlant:
+    def move_plant(self, path: str | Path, use: BeamUse) -> MovePlant:
         """Return the model of the rig for planning, with the beam of an analysis.
 
         `path` is a document of ``analyze --json``; if empty, the beam of the profile is used.

@@ -20,7 +20,7 @@ from rigd.control.damper import design_damper
 from rigd.engine.messages import PostRecordPlan
 from rigd.errors import UserError
 from rigd.excitation import KINDS, BeamEstimate, Excitation, MovePlant, Value, make_excitation
-from rigd.identified_beam import Use, read_identified_beam
+from rigd.identified_beam import BeamUse, read_identified_beam
 from rigd.profile import Profile
 from rigd.runner._move_plant import (
     loop_model_with,
@@ -151,7 +151,7 @@ class RigPreview:
         unclippable_peaks, clippable_peaks = _limited_peaks(self._profile, predicted_peaks)
         return _largest_fraction(unclippable_peaks + clippable_peaks)
 
-    def move_plant(self, path: str | Path, use: Use) -> MovePlant:
+    def move_plant(self, path: str | Path, use: BeamUse) -> MovePlant:
         """Return the model of motor, beam and closed loop that is used to plan a move.
 
         Parameters

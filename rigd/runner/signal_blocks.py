@@ -127,7 +127,7 @@ class SignalBlockReader:
         sample_array = np.concatenate(self._samples_since_gauges)
         self._samples_since_gauges = []
         self._cooled_torque_nm(sample_array.size / self._rate_hz)
-        return self._gauges.take(sample_array)
+        return self._gauges.gauges_of_block(sample_array)
 
     def _read_blocks(self, observer: RingObserver, end_index: int) -> Iterator[SignalBlock]:
         """Yield the unread samples before position `end_index` of the ring buffer in blocks."""
@@ -175,4 +175,4 @@ class SignalBlockReader:
         # Under the virtual clock a record is longer than the elapsed time.
         unsampled_duration_s = max(0.0, now_s - self._last_cooling_s - sampled_duration_s)
         self._last_cooling_s = now_s
-        return self._gauges.cool(unsampled_duration_s)
+        return self._gauges.cool_down(unsampled_duration_s)

@@ -127,5 +127,5 @@ class TouchModel:
             angle_delay_s,
             sensor_filter,
             source=str(path),
-            std=identified.std,
+            std=identified.parameter_stds,
         )

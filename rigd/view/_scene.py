@@ -247,7 +247,7 @@ class Scene:
 
     def _update_peaks(self, samples: Records) -> None:
         """Update the largest magnitude of each signal since the gauges were last drawn."""
-        largest_magnitudes = self._gauges.take(samples)
+        largest_magnitudes = self._gauges.gauges_of_block(samples)
         if not self._peaks_are_drawn:
             largest_magnitudes = {
                 signal_name: _gauge_with_larger_value(gauge, self._peaks.get(signal_name))

@@ -14,7 +14,7 @@ from rigd_netft.box import SimulatedBox
 from rigd_netft.sensor import NetFtSensor
 from rigd_netft.settings import NetFtSettings
 
-from rigd.check_rows import overall
+from rigd.check_rows import overall_verdict
 from rigd.checks import check_rig
 from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError
@@ -320,7 +320,7 @@ def test_sessions(tmp_path, faults, code, text):
 
 def test_check_reads_the_box(tmp_path):
     rows = check_rig(load_profile(write_rig(tmp_path)))
-    assert overall(rows) != "failed"
+    assert overall_verdict(rows) != "failed"
     found = " ".join(str(row.found) for row in rows)
     assert "rigd-netft" in found
     assert "FT00001" in found
