@@ -231,16 +231,24 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     from analysis.applicability import welch_exclusion_reason
     from analysis.models import MAX_FREQUENCY_TO_RATE_RATIO
     from rigd.spectral import SpectralError, segmentation_of
-    from rigd.sweep_response import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_decimation
+    from rigd.sweep_response import (
+        HIGHEST_SHOWN_HZ,
+        LOW_COHERENCE,
+        LOWEST_SHOWN_HZ,
+        response_decimation,
+    )
 
-    last_hz = min(LAST_HZ, MAX_FREQUENCY_TO_RATE_RATIO * record.rate_hz)
+    last_hz = min(HIGHEST_SHOWN_HZ, MAX_FREQUENCY_TO_RATE_RATIO * record.rate_hz)
     segmentation = segmentation_of(record.first_sweep_samples, record.rate_hz)
     resolution_hz = WINDOW.half_power_bins * record.rate_hz / segmentation.segment_length
     try:
         estimate = _estimate_response(record, segmentation, last_hz)
         # For steps, multisines and narrow sweeps, the coherence would depend on the segments.
         coherence_values = None
-        if estimate is not None and welch_exclusion_reason(record, (FIRST_HZ, last_hz)) is None:
+        if (
+            estimate is not None
+            and welch_exclusion_reason(record, (LOWEST_SHOWN_HZ, last_hz)) is None
+        ):
             coherence_values, segmentation = _estimate_coherence(
                 record, estimate, segmentation, last_hz
             )
@@ -253,7 +261,7 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     )
     is_shown_bin = (
         estimate.excited
-        & (undelayed_response.frequency_hz >= FIRST_HZ)
+        & (undelayed_response.frequency_hz >= LOWEST_SHOWN_HZ)
         & np.isfinite(undelayed_response.response)
     )
     shown_frequency_hz, shown_response = (

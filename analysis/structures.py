@@ -162,7 +162,9 @@ def added_structures(structure_names: Sequence[str]) -> tuple[AddedStructure, ..
         plugin = _REGISTRY.owner(name)
         if plugin is None:
             available_names = [
-                registered.name for registered in _REGISTRY.added() if not registered.problem
+                registered.name
+                for registered in _REGISTRY.added_plugins()
+                if not registered.problem
             ]
             raise LookupError(
                 f"no installed package adds a structure '{printable(name, 40)}'; "

@@ -60,7 +60,7 @@ class Estimate:
         return self if flag is None else replace(self, flag=self.flag or flag)
 
     def percent_above(self, reference_estimate: "Estimate") -> float:
-        """Return how far this value is above that of another estimate, in percent; NaN if it is 0."""
+        """Return the value's excess over that of another estimate in percent; NaN if that is 0."""
         return (
             100 * (self.value / reference_estimate.value - 1)
             if reference_estimate.value

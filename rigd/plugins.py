@@ -45,11 +45,11 @@ GROUPS: Final = {
 """Map from each group of entry points to the word for its parts in messages, and to the function
 that checks a part of the group."""
 
-_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_PART_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 """Pattern of the names that a package can add; they are keys of profiles and options."""
-_REFERENCE_PATTERN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+_OBJECT_REFERENCE_PATTERN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """Pattern of the object that an entry point names: module and attribute."""
-_MAX_FILE_BYTES = 1 << 20
+_MAX_ENTRY_POINTS_FILE_BYTES = 1 << 20
 """Largest size in bytes of a file ``entry_points.txt`` that is read."""
 _GROUP_HEADINGS = tuple(f"[{group}]".encode() for group in GROUPS)
 """Headings of the groups; a file without any of them adds no part."""
@@ -67,7 +67,7 @@ class Plugin:
     """Group of the entry point, a key of `GROUPS`."""
     name: str
     """Name of the part, such as the name of a device in a profile."""
-    reference: str
+    object_reference: str
     """Module and object that declare the part, as ``module:object``."""
     package: str
     """Name of the package."""
@@ -77,7 +77,7 @@ class Plugin:
     """Reason why the part cannot be used, as a sentence with a remedy; empty if none is known."""
 
     @property
-    def noun(self) -> str:
+    def part_noun(self) -> str:
         """Word for a part of the group, for messages."""
         return GROUPS[self.group][0]
 
@@ -88,8 +88,8 @@ class Plugin:
 
     def error(self, reason: str) -> PluginError:
         """Return the error that names package and part, with the reason as a sentence."""
-        text = f"Package {self.label}, {self.group} entry point {self.name}: {reason}"
-        return PluginError(printable(text))
+        message = f"Package {self.label}, {self.group} entry point {self.name}: {reason}"
+        return PluginError(printable(message))
 
 
 def installed_plugins(group: str) -> tuple[Plugin, ...]:
@@ -128,14 +128,14 @@ def find_plugin(group: str, name: str) -> Plugin | None:
     return None
 
 
-def load_plugin(plugin: Plugin, expected: type[T]) -> T:
+def load_plugin(plugin: Plugin, expected_type: type[T]) -> T:
     """Import a package and return the object that its entry point names.
 
     Parameters
     ----------
     plugin
         Part of an installed package.
-    expected
+    expected_type
         Type that the object must have.
 
     Raises
@@ -145,34 +145,34 @@ def load_plugin(plugin: Plugin, expected: type[T]) -> T:
     """
     if plugin.problem:
         raise plugin.error(plugin.problem)
-    module_name, _, object_name = plugin.reference.partition(":")
+    module_name, _, object_name = plugin.object_reference.partition(":")
     try:
         # A package that prints must not disturb the output of a command.
         with _without_working_folder(), contextlib.redirect_stdout(sys.stderr):
-            found = getattr(importlib.import_module(module_name), object_name)
+            named_object = getattr(importlib.import_module(module_name), object_name)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # SystemExit is no Exception
         raise plugin.error(
-            f"{plugin.reference} cannot be imported ({error_text(error)}); repair, upgrade or "
-            "uninstall the package."
-        ) from error
-    if not isinstance(found, expected):
-        raise plugin.error(
-            f"{plugin.reference} is a {type(found).__name__}, not a {expected.__name__}; repair, "
+            f"{plugin.object_reference} cannot be imported ({error_text(error)}); repair, "
             "upgrade or uninstall the package."
+        ) from error
+    if not isinstance(named_object, expected_type):
+        raise plugin.error(
+            f"{plugin.object_reference} is a {type(named_object).__name__}, not a "
+            f"{expected_type.__name__}; repair, upgrade or uninstall the package."
         )
-    return found
+    return named_object
 
 
-def load_declaration(plugin: Plugin, expected: type[D]) -> D:
+def load_declaration(plugin: Plugin, expected_type: type[D]) -> D:
     """Import a package and return the declaration of its part, which has the entry point's name.
 
     Parameters
     ----------
     plugin
         Part of an installed package.
-    expected
+    expected_type
         Type that the declaration must have.
 
     Raises
@@ -180,10 +180,10 @@ def load_declaration(plugin: Plugin, expected: type[D]) -> D:
     PluginError
         If the import fails in any way, or the declaration has another type or name.
     """
-    declaration = load_plugin(plugin, expected)
+    declaration = load_plugin(plugin, expected_type)
     if declaration.name != plugin.name:
         raise plugin.error(
-            f'it declares the {plugin.noun} "{declaration.name}"; the two names must be '
+            f'it declares the {plugin.part_noun} "{declaration.name}"; the two names must be '
             "equal: rename one."
         )
     return declaration
@@ -199,7 +199,7 @@ class Registry(Mapping[str, T]):
     ----------
     group
         Group of the entry points by which packages add parts, a key of `GROUPS`.
-    built_in
+    built_in_parts
         Parts that no package can replace, by name.
     load
         Function that imports and checks the part of a package; it raises `PluginError`.
@@ -210,12 +210,12 @@ class Registry(Mapping[str, T]):
     def __init__(
         self,
         group: str,
-        built_in: Mapping[str, T],
+        built_in_parts: Mapping[str, T],
         load: Callable[[Plugin], T],
         program: str = "rigd",
     ) -> None:
         self.group = group
-        self.built_in = built_in
+        self.built_in_parts = built_in_parts
         self._load = load
         self._program = program
 
@@ -227,7 +227,7 @@ class Registry(Mapping[str, T]):
         PluginError
             If the part is known to be unusable.
         """
-        return None if name in self.built_in else find_plugin(self.group, name)
+        return None if name in self.built_in_parts else find_plugin(self.group, name)
 
     def load(self, plugin: Plugin) -> T:
         """Import and check the part that a package adds.
@@ -238,30 +238,30 @@ class Registry(Mapping[str, T]):
             If the package cannot be imported, or its declaration is invalid or replaces a built-in
             part.
         """
-        if plugin.name in map(str.lower, self.built_in):
+        if plugin.name in map(str.lower, self.built_in_parts):
             raise plugin.error(
-                f"this {plugin.noun} is built into {self._program} and cannot be replaced; rename "
-                "it."
+                f"this {plugin.part_noun} is built into {self._program} and cannot be replaced; "
+                "rename it."
             )
         return self._load(plugin)
 
-    def added(self) -> tuple[Plugin, ...]:
+    def added_plugins(self) -> tuple[Plugin, ...]:
         """Return the parts that installed packages add, sorted by name; nothing is imported."""
         return installed_plugins(self.group)
 
     def names(self) -> list[str]:
         """Return the names of all parts, usable or not; nothing is imported."""
-        return [*self.built_in, *(plugin.name for plugin in self.added())]
+        return [*self.built_in_parts, *(plugin.name for plugin in self.added_plugins())]
 
     def __getitem__(self, name: str) -> T:
         """Return the part with a given name."""
         owner = self.owner(name)
-        return self.built_in[name] if owner is None else self.load(owner)
+        return self.built_in_parts[name] if owner is None else self.load(owner)
 
     def __iter__(self) -> Iterator[str]:
         """Yield the names of the parts that can be used."""
-        yield from self.built_in
-        for plugin in self.added():
+        yield from self.built_in_parts
+        for plugin in self.added_plugins():
             with contextlib.suppress(PluginError):
                 self.load(plugin)
                 yield plugin.name
@@ -286,7 +286,7 @@ def check_plugin(plugin: Plugin) -> str:
 
 @contextlib.contextmanager
 def plugin_errors(
-    plugin: Plugin | None, passed: tuple[type[Exception], ...] = ()
+    plugin: Plugin | None, passed_exceptions: tuple[type[Exception], ...] = ()
 ) -> Iterator[None]:
     """Turn an unexpected exception of a package's code into an error that names the package.
 
@@ -297,18 +297,23 @@ def plugin_errors(
     ----------
     plugin
         Part of a package, or None for a part of rigd.
-    passed
+    passed_exceptions
         Further exceptions that are passed on.
     """
-    passed_on: tuple[type[Exception], ...] = (UserError, FailureError, OSError, *passed)
+    passed_on_exceptions: tuple[type[Exception], ...] = (
+        UserError,
+        FailureError,
+        OSError,
+        *passed_exceptions,
+    )
     try:
         yield
-    except passed_on:
+    except passed_on_exceptions:
         raise
     except (Exception, SystemExit) as error:  # SystemExit is no Exception
         if plugin is None:
             raise
-        raise _failure_of(plugin, error) from error
+        raise _package_failure(plugin, error) from error
 
 
 def error_of_package(error: Exception, plugin: Plugin) -> PluginError | None:
@@ -321,17 +326,17 @@ def error_of_package(error: Exception, plugin: Plugin) -> PluginError | None:
     plugin
         Part of an installed package.
     """
-    package_module = plugin.reference.partition(":")[0].partition(".")[0]
+    package_module = plugin.object_reference.partition(":")[0].partition(".")[0]
     traceback = error.__traceback__
     while traceback is not None:
-        module = str(traceback.tb_frame.f_globals.get("__name__"))
-        if module.partition(".")[0] == package_module:
-            return _failure_of(plugin, error)
+        module_name = str(traceback.tb_frame.f_globals.get("__name__"))
+        if module_name.partition(".")[0] == package_module:
+            return _package_failure(plugin, error)
         traceback = traceback.tb_next
     return None
 
 
-def _failure_of(plugin: Plugin, error: BaseException) -> PluginError:
+def _package_failure(plugin: Plugin, error: BaseException) -> PluginError:
     """Return the error for an unexpected exception of a package's code."""
     return plugin.error(
         f"its code failed ({error_text(error)}); report that to the package's author."
@@ -375,8 +380,8 @@ def _search_folders() -> tuple[str, ...]:
 @lru_cache(maxsize=8)
 def _scan_folders(folders: tuple[str, ...]) -> tuple[Plugin, ...]:
     """Return all parts that the packages in these folders add, in the order of their names."""
-    found: list[Plugin] = []
-    packages: set[str] = set()
+    found_plugins: list[Plugin] = []
+    package_names: set[str] = set()
     for folder in folders:
         with contextlib.suppress(OSError), os.scandir(folder) as entries:
             for entry in sorted(entries, key=lambda e: e.name):
@@ -384,47 +389,51 @@ def _scan_folders(folders: tuple[str, ...]) -> tuple[Plugin, ...]:
                     continue
                 package, _, version = entry.name.removesuffix(".dist-info").partition("-")
                 normalized_name = re.sub(r"[-_.]+", "-", package).lower()
-                if normalized_name not in packages:  # else it is hidden by the one found before
-                    packages.add(normalized_name)
-                    found += _read_entry_points(
+                if (
+                    normalized_name not in package_names
+                ):  # else it is hidden by the one found before
+                    package_names.add(normalized_name)
+                    found_plugins += _read_entry_points(
                         Path(entry.path, "entry_points.txt"), normalized_name, version
                     )
-    return tuple(sorted(_with_clashes(found), key=lambda p: (p.group, p.name)))
+    return tuple(sorted(_with_clash_problems(found_plugins), key=lambda p: (p.group, p.name)))
 
 
-def _with_clashes(found: list[Plugin]) -> Iterator[Plugin]:
+def _with_clash_problems(found_plugins: list[Plugin]) -> Iterator[Plugin]:
     """Yield the parts, with a stated problem in those whose name several packages add."""
-    owners: dict[tuple[str, str], list[str]] = {}
-    for plugin in found:
-        owners.setdefault((plugin.group, plugin.name), []).append(plugin.label)
-    for plugin in found:
-        labels = owners[plugin.group, plugin.name]
-        clash_problem = f"{listed(labels)} add the same name; uninstall all but one."
-        yield plugin if len(labels) == 1 else replace(plugin, problem=clash_problem)
+    labels_by_part: dict[tuple[str, str], list[str]] = {}
+    for plugin in found_plugins:
+        labels_by_part.setdefault((plugin.group, plugin.name), []).append(plugin.label)
+    for plugin in found_plugins:
+        package_labels = labels_by_part[plugin.group, plugin.name]
+        clash_problem = f"{listed(package_labels)} add the same name; uninstall all but one."
+        yield plugin if len(package_labels) == 1 else replace(plugin, problem=clash_problem)
 
 
 def _read_entry_points(path: Path, package: str, version: str) -> Iterator[Plugin]:
     """Yield the parts that a package's file ``entry_points.txt`` names."""
     try:
         with path.open("rb") as file:
-            content = file.read(_MAX_FILE_BYTES)
+            file_bytes = file.read(_MAX_ENTRY_POINTS_FILE_BYTES)
     except OSError:
         return  # the package has none
-    if not any(heading in content for heading in _GROUP_HEADINGS):
+    if not any(heading in file_bytes for heading in _GROUP_HEADINGS):
         return
     group = ""
-    for line in content.decode("utf-8", errors="replace").splitlines():
-        text = line.strip()
-        if text.startswith("[") and text.endswith("]"):
-            group = text[1:-1].strip()
-        elif group in GROUPS and text and not text.startswith(("#", ";")):
-            name, equals_sign, reference = (part.strip() for part in text.partition("="))
-            reference = reference.partition("[")[0].strip()
+    for line in file_bytes.decode("utf-8", errors="replace").splitlines():
+        stripped_line = line.strip()
+        if stripped_line.startswith("[") and stripped_line.endswith("]"):
+            group = stripped_line[1:-1].strip()
+        elif group in GROUPS and stripped_line and not stripped_line.startswith(("#", ";")):
+            name, equals_sign, object_reference = (
+                part.strip() for part in stripped_line.partition("=")
+            )
+            object_reference = object_reference.partition("[")[0].strip()
             problem = ""
-            if not equals_sign or not _REFERENCE_PATTERN.fullmatch(reference):
+            if not equals_sign or not _OBJECT_REFERENCE_PATTERN.fullmatch(object_reference):
                 problem = "its line is not of the form name = module:object; correct it."
-            elif not _NAME_PATTERN.fullmatch(name):
+            elif not _PART_NAME_PATTERN.fullmatch(name):
                 problem = (
                     "its name is not of lower-case letters, digits and _, at most 32; rename it."
                 )
-            yield Plugin(group, printable(name, 40), reference, package, version, problem)
+            yield Plugin(group, printable(name, 40), object_reference, package, version, problem)

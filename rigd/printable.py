@@ -13,11 +13,11 @@ UNPRINTABLE: Final = "?"
 _MIN_GROUPED_NUMBER: Final = 10_000
 """Smallest number whose thousands are separated."""
 
-_MAX_LINES: Final = 40
+_MAX_MESSAGE_LINES: Final = 40
 """Largest number of lines of a displayed message."""
 _MAX_LINE_CHARACTERS: Final = 2000
 """Largest number of characters of a displayed line."""
-_LINE_END_LENGTH: Final = 500
+_SHOWN_LINE_END_CHARACTERS: Final = 500
 """Number of characters at the end of a truncated line that are shown: they state the remedy."""
 
 _BAR_STYLES: Final = {"bar.complete": "cyan", "bar.finished": "green", "bar.pulse": "cyan"}
@@ -61,17 +61,24 @@ def readable_message(message: str) -> str:
     a.toml: x = ?[2J is unknown.
     """
     # A line break of a quotation and one of the message are indistinguishable and both harmless.
-    message_lines = message.split("\n", _MAX_LINES)
-    shown_lines = [_readable_line(message_line) for message_line in message_lines[:_MAX_LINES]]
-    if len(message_lines) > _MAX_LINES:
-        shown_lines.append(f"… and {grouped(message_lines[-1].count(chr(10)) + 1)} more lines.")
+    message_lines = message.split("\n", _MAX_MESSAGE_LINES)
+    shown_lines = [
+        _readable_line(message_line) for message_line in message_lines[:_MAX_MESSAGE_LINES]
+    ]
+    if len(message_lines) > _MAX_MESSAGE_LINES:
+        shown_lines.append(
+            f"… and {count_with_separators(message_lines[-1].count(chr(10)) + 1)} more lines."
+        )
     return "\n".join(shown_lines)
 
 
 def _readable_line(line: str) -> str:
     """Return a line as safe text for a terminal, without the middle of a very long line."""
     if len(line) > _MAX_LINE_CHARACTERS:
-        line = f"{line[: _MAX_LINE_CHARACTERS - _LINE_END_LENGTH]} … {line[-_LINE_END_LENGTH:]}"
+        line = (
+            f"{line[: _MAX_LINE_CHARACTERS - _SHOWN_LINE_END_CHARACTERS]} … "
+            f"{line[-_SHOWN_LINE_END_CHARACTERS:]}"
+        )
     return printable(line)
 
 
@@ -87,13 +94,13 @@ def readable_errors() -> Iterator[None]:
         raise
 
 
-def grouped(count: int) -> str:
+def count_with_separators(count: int) -> str:
     """Format a whole number with separated thousands.
 
     Examples
     --------
-    >>> from rigd.printable import grouped
-    >>> print(grouped(136000), grouped(1200))
+    >>> from rigd.printable import count_with_separators
+    >>> print(count_with_separators(136000), count_with_separators(1200))
     136 000 1200
     """
     return f"{count:,}".replace(",", " ") if count >= _MIN_GROUPED_NUMBER else str(count)
@@ -133,13 +140,13 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     >>> print(counts_text({"recorded": 11_998, "scheduled": 12_000, "missed": 2, "late": 5}))
     11 998 of 12 000 samples, 2 missed, 5 late
     """
-    names_if_nonzero = ("lost", "stale_angles", "stale_wrenches")
+    count_names_if_nonzero = ("lost", "stale_angles", "stale_wrenches")
     count_phrases = [
         f"{_count_text(counts['recorded'])} of {_count_text(counts['scheduled'])} samples",
         *(f"{_count_text(counts[count_name])} {count_name}" for count_name in ("missed", "late")),
         *(
             f"{_count_text(counts[count_name])} {count_name.replace('_', ' ')}"
-            for count_name in names_if_nonzero
+            for count_name in count_names_if_nonzero
             if count_name in counts and (counts[count_name] is None or int(counts[count_name]))
         ),
     ]
@@ -148,17 +155,17 @@ def counts_text(counts: Mapping[str, Any]) -> str:
 
 def _count_text(count: int | str | None) -> str:
     """Format a count, or return "unknown" for None."""
-    return "unknown" if count is None else grouped(int(count))
+    return "unknown" if count is None else count_with_separators(int(count))
 
 
-def progress_bar(*texts: str, auto_refresh: bool = True) -> "Progress":
+def progress_bar(*column_texts: str, auto_refresh: bool = True) -> "Progress":
     """Return a progress line on standard error, which is removed after the work.
 
     The line is shown on a terminal only. Its `console` writes messages above it.
 
     Parameters
     ----------
-    *texts
+    *column_texts
         Texts between the bar and the remaining time, in the format of rich's task columns.
     auto_refresh
         Whether a thread of rich draws the line; otherwise only its `refresh` does.
@@ -172,7 +179,7 @@ def progress_bar(*texts: str, auto_refresh: bool = True) -> "Progress":
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        *map(TextColumn, texts),
+        *map(TextColumn, column_texts),
         TimeRemainingColumn(),
         console=console,
         transient=True,

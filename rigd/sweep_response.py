@@ -21,9 +21,9 @@ RealArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 """Array of complex numbers."""
 
-FIRST_HZ: Final = 0.5
+LOWEST_SHOWN_HZ: Final = 0.5
 """Lowest frequency shown. Below it the torque is lower than the sensor's noise."""
-LAST_HZ: Final = 60.0
+HIGHEST_SHOWN_HZ: Final = 60.0
 """Highest frequency shown: above the third mode and the band of the reference paper's chirp."""
 
 LOW_COHERENCE: Final = 0.8
@@ -31,7 +31,7 @@ LOW_COHERENCE: Final = 0.8
 
 The random error of its magnitude is then above 0.35/√n, with n averages (J. S. Bendat and A. G.
 Piersol, Random Data, 4th ed., Table 9.6)."""
-_FREQUENCY_GROUPS: Final = 200
+_FREQUENCY_GROUP_COUNT: Final = 200
 """Number of groups of points along the frequency axis, each drawn as two points.
 
 This is enough for the pixels of a view."""
@@ -65,7 +65,7 @@ class SweepResponse:
 
     Parameters
     ----------
-    sweep
+    sweep_tick_range
         First tick and end (exclusive) of the sweep.
     rate_hz
         Scheduled ticks per second.
@@ -77,13 +77,13 @@ class SweepResponse:
 
     def __init__(
         self,
-        sweep: tuple[int, int],
+        sweep_tick_range: tuple[int, int],
         rate_hz: float,
         last_hz: float,
         *,
         resolution_divisor: int = 1,
     ) -> None:
-        self._first_tick, end_tick = sweep
+        self._first_tick, end_tick = sweep_tick_range
         sweep_sample_count = end_tick - self._first_tick
         segmentation = segmentation_of(sweep_sample_count, rate_hz)
         segmentation = replace(
@@ -93,8 +93,8 @@ class SweepResponse:
         self._running_response = RunningResponse(
             rate_hz, sweep_sample_count, last_hz=last_hz, segmentation=segmentation
         )
-        self._at_rest: list[npt.NDArray[np.float64]] = []
-        self._rest_rad: float | None = None
+        self._angles_before_sweep_rad: list[npt.NDArray[np.float64]] = []
+        self._rest_angle_rad: float | None = None
 
     def feed(self, samples: npt.NDArray[Any]) -> None:
         """Add samples (n,) of ``SAMPLE_DTYPE`` to the estimate.
@@ -104,20 +104,22 @@ class SweepResponse:
         sweep_ticks = samples["tick"].astype(np.int64) - self._first_tick
         samples_before_sweep = int(np.searchsorted(sweep_ticks, 0))
         if samples_before_sweep:
-            self._at_rest.append(samples["angle_rad"][:samples_before_sweep].copy())
+            self._angles_before_sweep_rad.append(samples["angle_rad"][:samples_before_sweep].copy())
         if samples_before_sweep == len(samples):
             return
         # A constant angle causes no torque of the beam, but would leak into the lowest bins.
-        if self._rest_rad is None:
-            self._rest_rad = float(np.median(np.concatenate(self._at_rest or [np.zeros(1)])))
-            self._at_rest = []
+        if self._rest_angle_rad is None:
+            self._rest_angle_rad = float(
+                np.median(np.concatenate(self._angles_before_sweep_rad or [np.zeros(1)]))
+            )
+            self._angles_before_sweep_rad = []
         sweep_samples = samples[samples_before_sweep:]
         # A stale reading is not a measurement: its gap is filled like any other.
-        fresh_or_nan = np.where(sweep_samples["status"] & _STALE_STATUS, np.nan, 1.0)
+        nan_if_stale = np.where(sweep_samples["status"] & _STALE_STATUS, np.nan, 1.0)
         self._running_response.feed(
             sweep_ticks[samples_before_sweep:],
-            sweep_samples["angle_reference_rad"] - self._rest_rad,
-            (sweep_samples["angle_rad"] - self._rest_rad) * fresh_or_nan,
+            sweep_samples["angle_reference_rad"] - self._rest_angle_rad,
+            (sweep_samples["angle_rad"] - self._rest_angle_rad) * nan_if_stale,
             sweep_samples["coupling_torque_nm"],
         )
 
@@ -143,7 +145,7 @@ def nominal_response(
     tuple of two arrays (n,)
         Frequencies in Hz of the band that is shown; complex response in N·m/rad.
     """
-    frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
+    frequency_hz = np.arange(LOWEST_SHOWN_HZ, HIGHEST_SHOWN_HZ, _MODEL_STEP_HZ)
     s = 2j * np.pi * frequency_hz
     return frequency_hz, transfer(s, beam, damping) + tool_inertia_kg_m2 * s * s
 
@@ -157,7 +159,9 @@ def response_decimation(frequency_hz: RealArray) -> CurveDecimation:
         Increasing frequencies of the curves' points, shape (n,). Points outside the band of the
         charts are dropped.
     """
-    return CurveDecimation.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _FREQUENCY_GROUPS)
+    return CurveDecimation.logarithmic(
+        frequency_hz, LOWEST_SHOWN_HZ, HIGHEST_SHOWN_HZ, _FREQUENCY_GROUP_COUNT
+    )
 
 
 def nominal_damping(profile_bytes: bytes) -> Damping | None:

@@ -43,7 +43,7 @@ _MAX_DECIMALS: Final = 9
 """Largest number of decimals; smaller uncertainties are written with an exponent."""
 
 
-def suffix_of(key: str) -> str:
+def suffix_of(quantity_key: str) -> str:
     """Return the suffix of a key that names its unit, or "" if there is none.
 
     Examples
@@ -51,10 +51,10 @@ def suffix_of(key: str) -> str:
     >>> suffix_of("beam.bending_stiffness_n_m2")
     '_n_m2'
     """
-    return next((unit_suffix for unit_suffix in UNITS if key.endswith(unit_suffix)), "")
+    return next((unit_suffix for unit_suffix in UNITS if quantity_key.endswith(unit_suffix)), "")
 
 
-def unit_of(key: str) -> str:
+def unit_of(quantity_key: str) -> str:
     """Return the unit that the suffix of a key names, or "" if there is none.
 
     Examples
@@ -62,7 +62,7 @@ def unit_of(key: str) -> str:
     >>> unit_of("rated_torque_nm")
     'N·m'
     """
-    return UNITS.get(suffix_of(key), "")
+    return UNITS.get(suffix_of(quantity_key), "")
 
 
 def with_half_width(value: float, interval: Sequence[float] | None, scale: float = 1.0) -> str:
@@ -85,11 +85,11 @@ def with_half_width(value: float, interval: Sequence[float] | None, scale: float
     half_width = 0.0 if interval is None else (interval[1] - interval[0]) / 2
     if not 0 < scale * half_width < inf:
         return f"{scale * value:.5g}"
-    return " ± ".join(to_uncertainty((value, half_width), half_width, scale))
+    return " ± ".join(rounded_to_uncertainty((value, half_width), half_width, scale))
 
 
-def to_uncertainty(
-    numbers: Sequence[float], uncertainty: float, scale: float = 1.0, sign: str = ""
+def rounded_to_uncertainty(
+    numbers: Sequence[float], uncertainty: float, scale: float = 1.0, sign_format: str = ""
 ) -> tuple[str, ...]:
     """Format numbers, rounded to two digits of their uncertainty.
 
@@ -102,30 +102,32 @@ def to_uncertainty(
         digits are written.
     scale
         Factor by which numbers and uncertainty are multiplied, such as 100 for per cent.
-    sign
+    sign_format
         "+" to write the sign of positive numbers too.
 
     Examples
     --------
-    >>> to_uncertainty((0.0305891, 0.0306012), 6e-6, 100.0, "+")
+    >>> rounded_to_uncertainty((0.0305891, 0.0306012), 6e-6, 100.0, "+")
     ('+3.05891', '+3.06012')
-    >>> to_uncertainty((1.23456e-12,), 1e-15)
+    >>> rounded_to_uncertainty((1.23456e-12,), 1e-15)
     ('1.2346e-12',)
     """
     scaled_uncertainty = scale * uncertainty
     if not 0 < scaled_uncertainty < inf:
-        return tuple(f"{scale * number:{sign}.5g}" for number in numbers)
+        return tuple(f"{scale * number:{sign_format}.5g}" for number in numbers)
     decimal_count = decimals(scaled_uncertainty)
     if decimal_count <= _MAX_DECIMALS:
-        return tuple(f"{scale * number:{sign}.{decimal_count}f}" for number in numbers)
+        return tuple(f"{scale * number:{sign_format}.{decimal_count}f}" for number in numbers)
     largest_size = (
         max((abs(scale * number) for number in numbers), default=0.0) or scaled_uncertainty
     )
-    power = decimal_count + floor(log10(largest_size))
-    return tuple(f"{scale * number:{sign}.{max(power, 1) + 1}g}" for number in numbers)
+    digits_after_first = decimal_count + floor(log10(largest_size))
+    return tuple(
+        f"{scale * number:{sign_format}.{max(digits_after_first, 1) + 1}g}" for number in numbers
+    )
 
 
-def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "") -> str:
+def interval_text(interval: Sequence[float], scale: float = 1.0, sign_format: str = "") -> str:
     """Format an interval, rounded to two digits of its half-width.
 
     Parameters
@@ -134,7 +136,7 @@ def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "")
         Lower and upper limit.
     scale
         Factor by which the limits are multiplied, such as 100 for per cent.
-    sign
+    sign_format
         "+" to write the sign of positive limits too.
 
     Examples
@@ -143,7 +145,7 @@ def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "")
     '-16.9132 to -16.9084'
     """
     half_width = (interval[1] - interval[0]) / 2
-    return " to ".join(to_uncertainty(interval, half_width, scale, sign))
+    return " to ".join(rounded_to_uncertainty(interval, half_width, scale, sign_format))
 
 
 def with_percentage(std: float, value: float) -> str:
@@ -206,4 +208,4 @@ def finite_number(value: object) -> float | None:
         float_value = float(value)
     except OverflowError:
         return None
-    return float_value if isfinite(float_value) else None
+    return float_value if isfinite(finite_or_infinite) else None

@@ -10,7 +10,7 @@ from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.identify.sentences import LOSS_NAMES, loss_slope_sentence
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
-from rigd.units import to_uncertainty
+from rigd.units import rounded_to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,7 +116,7 @@ def describe_orders_if_exact(
         ):
             continue
         half_width = (exact_order.interval[1] - exact_order.interval[0]) / 2
-        value_text, low_text, high_text = to_uncertainty(
+        value_text, low_text, high_text = rounded_to_uncertainty(
             (exact_order.value, *exact_order.interval), exact_order.std or half_width
         )
         conclusion_by_status = {
@@ -174,7 +174,7 @@ def _describe_mode_change(mode_change: ModeInSweeps) -> str:
 
     def change_text(relative_change: float, std: float) -> str:
         """Format a relative change in per cent, with its 95 % interval and direction."""
-        change_size, interval_text = to_uncertainty(
+        change_size, interval_text = rounded_to_uncertainty(
             (abs(relative_change), NORMAL_95 * std), std, 100.0
         )
         return f"{change_size} ± {interval_text} % {'higher' if relative_change > 0 else 'lower'}"

@@ -14,7 +14,7 @@ from analysis.models import STRUCTURES
 from analysis.statistics import student_t_quantile
 from rigd.beam import COEFFICIENT_OF
 from rigd.printable import listed
-from rigd.units import decimals, to_uncertainty
+from rigd.units import decimals, rounded_to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -112,7 +112,7 @@ def _value_and_half_width(pooled_order: PooledOrder) -> str | None:
     if value is None or interval is None or pooled_order.reason is not None:
         return None
     half_width = (interval[1] - interval[0]) / 2
-    return " ± ".join(to_uncertainty((value, half_width), pooled_order.std or half_width))
+    return " ± ".join(rounded_to_uncertainty((value, half_width), pooled_order.std or half_width))
 
 
 def _loss_slope_clause(pooled_order: PooledOrder) -> str:
@@ -172,7 +172,7 @@ def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[st
             loss_factor.size.std and loss_factor.size.interval_95
         ):
             continue
-        value_text, low_text, high_text = to_uncertainty(
+        value_text, low_text, high_text = rounded_to_uncertainty(
             (loss_factor.size.value, *loss_factor.size.interval_95), loss_factor.size.std
         )
         remark = f", {loss_factor.size.flag}" if loss_factor.size.flag else ""
@@ -311,7 +311,7 @@ def describe_order(pooled_order: PooledOrder) -> str:
             f"{pooled_order.reason}.{sessions_text}"
         )
     half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
-    value_text, low_text, high_text = to_uncertainty(
+    value_text, low_text, high_text = rounded_to_uncertainty(
         (pooled_order.value, *pooled_order.interval), pooled_order.std or half_width
     )
     order_statement = (
@@ -384,15 +384,15 @@ def describe_welch_bias(
 def _bias_clause(parameter_bias: ParameterBias) -> str:
     """Describe the value of one parameter of a Welch fit and its bias."""
     symbol, display_factor, display_unit = label_and_unit(parameter_bias.parameter)
-    value_text, scatter_text = to_uncertainty(
+    value_text, scatter_text = rounded_to_uncertainty(
         (parameter_bias.welch_mean, parameter_bias.welch_std),
         parameter_bias.welch_std,
         display_factor,
     )
-    (record_text,) = to_uncertainty(
+    (record_text,) = rounded_to_uncertainty(
         (parameter_bias.record_estimate,), parameter_bias.record_std, display_factor
     )
-    (bias_text,) = to_uncertainty(
+    (bias_text,) = rounded_to_uncertainty(
         (abs(parameter_bias.bias),), parameter_bias.bias_std, display_factor
     )
     shown_name = parameter_bias.parameter if parameter_bias.parameter in _ORDER_NAMES else symbol

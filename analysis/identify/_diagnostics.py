@@ -16,7 +16,7 @@ from analysis.identify._finding import Finding
 from analysis.identify._leakage import repetition_period_s
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.statistics import NORMAL_95, chi_square_deviate
-from rigd.units import interval_text, to_uncertainty
+from rigd.units import interval_text, rounded_to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -142,7 +142,7 @@ def _instrument_findings(candidate_set: CandidateSet, headline: Headline) -> Ite
     if deviation is not None and abs(deviation[0]) > _MIN_REPORTED_DELAY_S:
         setting_deviation, *deviation_interval = deviation
         interval_low, interval_high = deviation_interval
-        (rounded_size,) = to_uncertainty(
+        (rounded_size,) = rounded_to_uncertainty(
             (abs(setting_deviation),), (interval_high - interval_low) / 2, 1e3
         )
         delay_s = headline.parameters["delay_s"].value
@@ -163,7 +163,7 @@ def _instrument_findings(candidate_set: CandidateSet, headline: Headline) -> Ite
     if deviation := _significant_deviation(candidate_set, headline, "tool_inertia_kg_m2"):
         setting_deviation, *deviation_interval = deviation
         interval_low, interval_high = deviation_interval
-        (rounded_size,) = to_uncertainty(
+        (rounded_size,) = rounded_to_uncertainty(
             (setting_deviation,), (interval_high - interval_low) / 2, 1e6
         )
         yield Finding(
@@ -194,7 +194,7 @@ def _beam_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[
             continue
         relative_deviation, *deviation_interval = (bound / stated_value for bound in deviation)
         interval_low, interval_high = deviation_interval
-        (percent_size,) = to_uncertainty(
+        (percent_size,) = rounded_to_uncertainty(
             (abs(relative_deviation),), (interval_high - interval_low) / 2, 100
         )
         other_causes = _equivalent_causes(candidate_set, setting_name)
@@ -469,7 +469,9 @@ def _drag_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     if drag is None:
         return
     interval_low_m, interval_high_m = drag.interval_95_m
-    (rounded_sizes,) = to_uncertainty((drag.value_m,), (interval_high_m - interval_low_m) / 2, 1e3)
+    (rounded_sizes,) = rounded_to_uncertainty(
+        (drag.value_m,), (interval_high_m - interval_low_m) / 2, 1e3
+    )
     yield Finding(
         kind="air drag",
         sentence=(

@@ -25,7 +25,7 @@ import numpy as np
 from analysis.identify._finding import Finding
 from analysis.identify._modal_fit import fit_modes, modes_with_poles
 from analysis.identify.drag_torque import DragError, DragLaw
-from rigd.units import to_uncertainty
+from rigd.units import rounded_to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -113,7 +113,7 @@ class ModesWithDrag:
 
     def finding(self) -> Finding:
         """Return the finding that the damping ratios are those without air, and less certain."""
-        drag_mm, std_mm = to_uncertainty((self.law.constant_m, self.std_m), self.std_m, 1e3)
+        drag_mm, std_mm = rounded_to_uncertainty((self.law.constant_m, self.std_m), self.std_m, 1e3)
         return Finding(
             kind="air drag",
             sentence=(

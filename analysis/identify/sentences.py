@@ -11,7 +11,7 @@ from analysis.identify.verdict import SECOND_DAMPING_REASON, deviance_of_order_o
 from analysis.statistics import NORMAL_95
 from rigd.beam import DAMPING_PARAMETERS
 from rigd.printable import listed
-from rigd.units import decimals, to_uncertainty
+from rigd.units import decimals, rounded_to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -183,7 +183,7 @@ def loss_slope_sentence(
         Reason why the order is not established. None if it is established.
     """
     std = (order_interval[1] - order_interval[0]) / (2 * NORMAL_95)
-    value_text, low_text, high_text = to_uncertainty((order_value, *order_interval), std)
+    value_text, low_text, high_text = rounded_to_uncertainty((order_value, *order_interval), std)
     condition_text = "by damping ratios and residue phases alone"
     if estimate.basis == "geometry":
         condition_text = (
@@ -224,7 +224,7 @@ def order_sentence(order_verdict: OrderVerdict) -> str:
     lower_end, upper_end = order_profile.interval
     order_name, damping_name = order_verdict.order, _DAMPING_OF_ORDER[order_verdict.order]
     std = (upper_end - lower_end) / (2 * NORMAL_95)
-    estimate_text, first_text, last_text = to_uncertainty(
+    estimate_text, first_text, last_text = rounded_to_uncertainty(
         (order_profile.estimate, lower_end, upper_end), std
     )
     order_text = f"{estimate_text} (95 %: {first_text} to {last_text})"

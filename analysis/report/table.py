@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from rigd.beam import COEFFICIENT_OF
-from rigd.units import to_uncertainty
+from rigd.units import rounded_to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -424,7 +424,9 @@ def estimate_cells(
         if estimate_value is None or not math.isfinite(estimate_value)
         else Cell(
             estimate_value,
-            to_uncertainty((estimate_value,), std or 0.0, display_factor)[0].replace("-", "−"),
+            rounded_to_uncertainty((estimate_value,), std or 0.0, display_factor)[0].replace(
+                "-", "−"
+            ),
         )
         for estimate_value in estimate_values
     )

@@ -77,7 +77,7 @@ def known_selections() -> list[str]:
         for sensor in SHIPPED.values()
         if drive.open_drive and sensor.open_sensor and can_be_combined(drive, sensor)
     ]
-    added_device_names = [plugin.name for plugin in DEVICES.added()]
+    added_device_names = [plugin.name for plugin in DEVICES.added_plugins()]
     return [
         *selection_phrases,
         *(

@@ -177,7 +177,7 @@ _GROUP_BY_ADDED_SECTION: dict[str, str] = {}
 def optional_sections() -> tuple[str, ...]:
     """Return the names of the sections that only some devices or controllers require."""
     built_in_sections = [
-        name for kind in DEVICES.built_in.values() for name in kind.required_sections
+        name for kind in DEVICES.built_in_parts.values() for name in kind.required_sections
     ]
     return tuple(dict.fromkeys([*built_in_sections, *sorted(_GROUP_BY_ADDED_SECTION)]))
 
@@ -195,7 +195,9 @@ def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
         owner_text = (
             "another package's part" if kind.name in _GROUP_BY_ADDED_SECTION else "every profile"
         )
-        raise plugin.error(f"[{kind.name}] is a section of {owner_text}; rename the {plugin.noun}.")
+        raise plugin.error(
+            f"[{kind.name}] is a section of {owner_text}; rename the {plugin.part_noun}."
+        )
     if problem := _settings_problem(settings_class):
         raise plugin.error(f"its settings {settings_class.__name__} are invalid: {problem}")
     if unknown := set(kind.required_sections) - {kind.name} - set(SECTIONS):

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from rigd.estimates import modes_from_json
-from rigd.printable import counts_text, grouped, listed, printable
+from rigd.printable import count_with_separators, counts_text, listed, printable
 from rigd.session import limits
 from rigd.session._errors import SessionError
 from rigd.session._reader import ORDER_AND_FLAG_FIELDS, LoggedEvent, Session, read_session
@@ -129,11 +129,11 @@ class SessionInfo:
             *(("recovered", f"{k}: {v}") for k, v in _recovery_entries(self.outcome or {}).items()),
             (
                 "samples",
-                f"{grouped(self.samples)} at {self.rate_hz:g} Hz, {self.duration_s:g} s, "
-                f"{grouped(self.missing_ticks)} ticks missing",
+                f"{count_with_separators(self.samples)} at {self.rate_hz:g} Hz, "
+                f"{self.duration_s:g} s, {count_with_separators(self.missing_ticks)} ticks missing",
             ),
             *(
-                ("flagged", f"{name}: {grouped(n)} samples")
+                ("flagged", f"{name}: {count_with_separators(n)} samples")
                 for name, n in self.status_counts.items()
             ),
             *(
@@ -244,8 +244,8 @@ def _missing_samples_sentence(session: Session) -> str:
     present_text = f"those of ticks {ticks[0]} to {ticks[-1]} are" if len(ticks) else "none is"
     if recorded_count > len(ticks):
         return (
-            f"{grouped(recorded_count - len(ticks))} of the {grouped(recorded_count)} samples "
-            "that were "
+            f"{count_with_separators(recorded_count - len(ticks))} of the "
+            f"{count_with_separators(recorded_count)} samples that were "
             f"recorded are not in this file ({present_text}): it was trimmed. Take the original."
         )
     first_present_tick, present_end_tick = (

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rigd.gauges import Gauge, Gauges
 from rigd.spectral import RunningSpectrogram
-from rigd.sweep_response import LAST_HZ, SweepResponse
+from rigd.sweep_response import HIGHEST_SHOWN_HZ, SweepResponse
 from rigd.view import banner
 from rigd.view._antenna import Antenna
 from rigd.view._fits import fit_record, fit_source, send_table
@@ -81,7 +81,7 @@ class Scene:
             fit_modes=session.fit_modes,
             with_target_std=with_target_std,
         )
-        last_hz = min(LAST_HZ, session.rate_hz / 2)
+        last_hz = min(HIGHEST_SHOWN_HZ, session.rate_hz / 2)
         self._antenna = Antenna(session)
         self._response = SweepResponse(session.sweep, session.rate_hz, last_hz)
         self.response_charts = ResponseCharts(session, last_response)

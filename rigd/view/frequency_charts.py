@@ -10,9 +10,9 @@ import numpy.typing as npt
 from rigd.beam import Damping
 from rigd.spectral import PHASE_START_DEG, CurveDecimation, magnitude_db, phase_deg
 from rigd.sweep_response import (
-    FIRST_HZ,
-    LAST_HZ,
+    HIGHEST_SHOWN_HZ,
     LOW_COHERENCE,
+    LOWEST_SHOWN_HZ,
     nominal_response,
     response_decimation,
 )
@@ -200,7 +200,7 @@ class ResponseCharts:
         self._last_update: tuple[RealArray, ComplexArray] | None = None
         self._curves: dict[str, Sequence[RealArray]] = {}
         self._uncertain: dict[str, Sequence[RealArray]] = {}
-        self._excited_hz = (LAST_HZ, LAST_HZ)
+        self._excited_hz = (HIGHEST_SHOWN_HZ, HIGHEST_SHOWN_HZ)
         self._note = NO_COHERENCE_YET
 
     def chart(self, entity_path: str) -> Chart:
@@ -272,7 +272,9 @@ class ResponseCharts:
                     np.where(is_excited, curve_values, np.nan)
                 )
         excited_ends_hz = (
-            frequency_hz[is_excited][[0, -1]] if is_excited.any() else (LAST_HZ, LAST_HZ)
+            frequency_hz[is_excited][[0, -1]]
+            if is_excited.any()
+            else (HIGHEST_SHOWN_HZ, HIGHEST_SHOWN_HZ)
         )
         self._excited_hz = float(excited_ends_hz[0]), float(excited_ends_hz[1])
         no_coherence_text = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
@@ -289,7 +291,7 @@ class ResponseCharts:
                 chart.draw_curve(stream, "uncertain", uncertain_curve, UNCERTAIN_ENTRY)
             measured_curve = self._curves.get(chart.entity, ())
             chart.draw_curve(stream, "measured", measured_curve, response_curve.key, curve_order=1)
-            ends_hz = (FIRST_HZ, *self._excited_hz, LAST_HZ)
+            ends_hz = (LOWEST_SHOWN_HZ, *self._excited_hz, HIGHEST_SHOWN_HZ)
             for name, first_hz, last_hz in zip(
                 _SHADE_NAMES, ends_hz[::2], ends_hz[1::2], strict=True
             ):
@@ -401,7 +403,7 @@ def _chart(entity_path: str, vertical_axis: Axis, *legend_entries: LegendEntry) 
     ):  # there is room for another entry
         legend_entries = (*legend_entries, NOT_ESTIMATED_ENTRY)
     return response_chart(
-        entity_path, chart_size, (FIRST_HZ, LAST_HZ), vertical_axis, *legend_entries
+        entity_path, chart_size, (LOWEST_SHOWN_HZ, HIGHEST_SHOWN_HZ), vertical_axis, *legend_entries
     )
 
 

@@ -14,7 +14,12 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
 from rigd.spectral import CurveDecimation
-from rigd.sweep_response import LAST_HZ, SweepResponse, nominal_response, response_decimation
+from rigd.sweep_response import (
+    HIGHEST_SHOWN_HZ,
+    SweepResponse,
+    nominal_response,
+    response_decimation,
+)
 
 Document = dict[str, Any]
 RealArray = npt.NDArray[np.float64]
@@ -174,7 +179,7 @@ class SessionResponse:
     ) -> None:
         self._delays_s = {"input_delay_s": angle_delay_s, "output_delay_s": torque_delay_s}
         self._sweep = SweepResponse(
-            sweep_ticks, rate_hz, LAST_HZ, resolution_divisor=_FREQUENCY_STEP_FACTOR
+            sweep_ticks, rate_hz, HIGHEST_SHOWN_HZ, resolution_divisor=_FREQUENCY_STEP_FACTOR
         )
         self._thinning: CurveDecimation | None = None
         self._queued_blocks: list[PageSignalBlock] = []

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.beam import transfer
 from rigd.spectral import FrequencyResponse, RunningEstimate, magnitude_db, phase_deg
-from rigd.sweep_response import FIRST_HZ, LAST_HZ
+from rigd.sweep_response import HIGHEST_SHOWN_HZ, LOWEST_SHOWN_HZ
 from rigd.view.frequency_charts import (
     COHERENCE_ENTITY,
     MAGNITUDE_ENTITY,
@@ -66,10 +66,10 @@ def test_measured_response_lies_on_its_model(description, shown, delays_s, tool_
         (OVERVIEW_MAGNITUDE_ENTITY, magnitude_db),
         (PHASE_ENTITY, phase_deg),
     ):
-        for name, last_hz in (("measured", 20.0), ("model", LAST_HZ)):
+        for name, last_hz in (("measured", 20.0), ("model", HIGHEST_SHOWN_HZ)):
             (strip,) = strips(found[f"{entity}/{name}"])
             frequency_hz, seen = values(charts, entity, strip)
-            assert frequency_hz[0] == pytest.approx(FIRST_HZ, rel=1e-3)
+            assert frequency_hz[0] == pytest.approx(LOWEST_SHOWN_HZ, rel=1e-3)
             assert frequency_hz[-1] == pytest.approx(last_hz, rel=5e-3)
             s = 2j * np.pi * frequency_hz
             exact = transfer(s, description.beam, description.damping) + tool_inertia_kg_m2 * s * s
@@ -137,7 +137,7 @@ def test_response_with_low_coherence_is_grey(description, shown):
         assert values(charts, entity, above)[0].min() == pytest.approx(8.0, rel=0.02)
         (grey,) = strips(found[f"{entity}/uncertain"])
         ends_hz = values(charts, entity, grey)[0][[0, -1]]
-        assert ends_hz == pytest.approx((FIRST_HZ, 20.0), rel=5e-3)
+        assert ends_hz == pytest.approx((LOWEST_SHOWN_HZ, 20.0), rel=5e-3)
         assert found[f"{entity}/uncertain"].last("LineStrips2D:colors") == packed(GREY)
     (whole,) = strips(found[f"{COHERENCE_ENTITY}/measured"])
     assert values(charts, COHERENCE_ENTITY, whole)[1].min() == pytest.approx(0.5, abs=1e-3)
