@@ -208,4 +208,4 @@ def finite_number(value: object) -> float | None:
         float_value = float(value)
     except OverflowError:
         return None
-    return float_value if isfinite(finite_or_infinite) else None
+    return float_value if isfinite(float_value) else None
