@@ -186,7 +186,7 @@ def _show_view(live_view: "LiveAddress") -> None:
         finally:
             viewer.close()
     if exit_code:
-        fail(f"{viewer.fault} rigd live --web shows the same in a browser.", EXIT_FAILED)
+        fail(f"{viewer.closing_reason} rigd live --web shows the same in a browser.", EXIT_FAILED)
 
 
 def _follow_servers(viewer: "Viewer", view: "LiveAddress") -> int:
@@ -325,7 +325,8 @@ def _open_window(rerun_path: Path, scratch_path: Path, shown_path: Path) -> None
         )
         if file_window.wait():
             fail(
-                f"{file_window.fault} rigd replay {shown_path} --web shows the same in a browser.",
+                f"{file_window.closing_reason} rigd replay {shown_path} --web shows the same in a "
+                "browser.",
                 EXIT_FAILED,
             )
 

@@ -37,7 +37,7 @@ _MAX_LOCK_WAIT_S: Final = 2.0
 _DAMAGE_ERROR_CODES: Final = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 """SQLite's error codes for a damaged index."""
 
-_SQL_TYPES: Final = {
+_SQL_TYPES_BY_COLUMN: Final = {
     "id": "TEXT",
     "start_utc": "TEXT",
     "start_utc_ns": "INTEGER",
@@ -64,9 +64,9 @@ _SQL_TYPES: Final = {
 """SQL type of each column except ``file`` and ``stamp``.
 
 Modes, validity and meta are JSON; ``start_utc`` is in ISO 8601."""
-_PYTHON_TYPES: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
+_PYTHON_TYPES_BY_SQL_TYPE: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
 """Python type that a value read from a column must have, by the SQL type of the column."""
-_COLUMNS_TO_READ: Final = tuple(name for name in _SQL_TYPES if name != "start_utc")
+_COLUMNS_TO_READ: Final = tuple(name for name in _SQL_TYPES_BY_COLUMN if name != "start_utc")
 """Columns that are read from the index: all but the start time as text, which is for other
 programs."""
 
@@ -74,7 +74,7 @@ StampedRow = tuple[str, SessionRow]
 """Stamp of a row (sizes and times of its source files), and the row."""
 
 
-class Index:
+class LibraryIndex:
     """Index file with the data of the sessions in one folder (SQLite).
 
     The folder need not have an index or be writable.
@@ -93,7 +93,7 @@ class Index:
             return {}
         indexed_rows: dict[str, StampedRow] = {}
         try:
-            with self._connection("ro") as database:
+            with self._open_database("ro") as database:
                 if database.execute("PRAGMA user_version").fetchone() != (_INDEX_VERSION,):
                     return {}
                 column_list = ", ".join(("file", "stamp", *_COLUMNS_TO_READ))
@@ -119,21 +119,24 @@ class Index:
         if self._path.exists() and not self._is_own_index():
             return  # the file is not an index of this program
         try:
-            self._store(new_rows, missing_files)
+            self._store_rows(new_rows, missing_files)
         except sqlite3.Error as error:
             if error.sqlite_errorcode & 0xFF not in _DAMAGE_ERROR_CODES:
                 return  # a folder that cannot be written to, a full disk, a lock held for long
             with contextlib.suppress(OSError, sqlite3.Error):  # the session files contain all data
                 self._path.unlink()
-                self._store(new_rows, missing_files)
+                self._store_rows(new_rows, missing_files)
 
-    def _store(self, new_rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
+    def _store_rows(
+        self, new_rows: Mapping[str, StampedRow], missing_files: Collection[str]
+    ) -> None:
         """Store and remove rows in one transaction, and create the table if necessary."""
-        with self._connection("rwc") as database:
+        with self._open_database("rwc") as database:
             database.execute("BEGIN IMMEDIATE")
             if database.execute("PRAGMA user_version").fetchone() != (_INDEX_VERSION,):
                 column_definitions = ", ".join(
-                    f"{column_name} {sql_type}" for column_name, sql_type in _SQL_TYPES.items()
+                    f"{column_name} {sql_type}"
+                    for column_name, sql_type in _SQL_TYPES_BY_COLUMN.items()
                 )
                 database.execute("DROP TABLE IF EXISTS sessions")
                 database.execute(
@@ -146,7 +149,7 @@ class Index:
                 "DELETE FROM sessions WHERE file = ?",
                 [(file_name,) for file_name in missing_files if _is_storable_name(file_name)],
             )
-            column_names = ("file", "stamp", *_SQL_TYPES)
+            column_names = ("file", "stamp", *_SQL_TYPES_BY_COLUMN)
             placeholders = ", ".join("?" * len(column_names))
             database.executemany(
                 f"INSERT OR REPLACE INTO sessions ({', '.join(column_names)}) VALUES "
@@ -160,7 +163,7 @@ class Index:
             database.execute("COMMIT")
 
     @contextmanager
-    def _connection(self, open_mode: str) -> Iterator[sqlite3.Connection]:
+    def _open_database(self, open_mode: str) -> Iterator[sqlite3.Connection]:
         """Provide a connection to the index, without implicit transactions."""
         # Explicit transactions: the implicit ones would commit before a table is created.
         database = sqlite3.connect(
@@ -195,7 +198,7 @@ class Index:
         report_name = column_values["report"]
         for column_name, column_value in column_values.items():
             if column_name != "report" and not isinstance(
-                column_value, _PYTHON_TYPES[_SQL_TYPES[column_name]]
+                column_value, _PYTHON_TYPES_BY_SQL_TYPE[_SQL_TYPES_BY_COLUMN[column_name]]
             ):
                 raise TypeError(column_name)
         column_values["modes"] = usable_modes(json.loads(str(column_values["modes"])))
@@ -220,7 +223,7 @@ def _column_values(row: SessionRow) -> list[object]:
     values_by_name["validity"] = json.dumps(row.validity)
     values_by_name["meta"] = json.dumps(row.meta)
     values_by_name["report"] = row.report and os.fspath(row.report.relative_to(row.path.parent))
-    return [values_by_name[name] for name in _SQL_TYPES]
+    return [values_by_name[name] for name in _SQL_TYPES_BY_COLUMN]
 
 
 def _iso_time(utc_ns: int) -> str | None:

@@ -35,7 +35,7 @@ _MAX_COUNT_DIGITS: Final = 18
 """Largest number of digits with which every number is below 2**63."""
 
 """Mode of a session as in JSON documents."""
-Document = dict[str, Any]
+JsonObject = dict[str, Any]
 """JSON object."""
 
 
@@ -84,7 +84,7 @@ class SessionRow:
     """Number of samples that were measured but not recorded."""
     modes: tuple[ReportedMode, ...] = ()
     """Modes of the last report or, if there is no report, of the quick look."""
-    validity: Document | None = None
+    validity: JsonObject | None = None
     """Validity of the linear model for the modes, as `rigd.session.Validity.as_json`; None if there
     are no modes."""
     report: Path | None = None
@@ -104,7 +104,7 @@ class SessionRow:
             "modes": self.mode_documents(),
         }
 
-    def mode_documents(self) -> list[Document]:
+    def mode_documents(self) -> list[JsonObject]:
         """Return the modes as JSON objects, without their numbers."""
         documents = [mode.as_json() for mode in self.modes]
         return [
@@ -114,23 +114,23 @@ class SessionRow:
 
 
 def read_row(
-    path: Path, quick_look: Path | None, report_folder: Path | None
+    path: Path, quick_look_path: Path | None, report_folder: Path | None
 ) -> tuple[SessionRow, bool]:
     """Return the data of a session, and whether they can be stored in the index.
 
     A file that cannot be read is reported in the row. After a system error, which may be temporary,
-    the index must not store the row. `quick_look` is the file with the session's quick look, and
-    `report_folder` the folder of its last report; None if there is none. Raise `FileNotFoundError`
-    if the session file no longer exists.
+    the index must not store the row. `quick_look_path` is the file with the session's quick look,
+    and `report_folder` the folder of its last report; None if there is none. Raise
+    `FileNotFoundError` if the session file no longer exists.
     """
     from rigd.session import SessionAccessError, SessionError, read_summary
     from rigd.session.user_metadata import added_metadata
 
     file_bytes = path.stat().st_size
     session_id = path.name.removesuffix(INCOMPLETE_SUFFIX).removesuffix(SESSION_SUFFIX)
-    results_of_analysis: dict[str, Any] = _modes_of_results(quick_look, report_folder)
+    modes_and_validity: dict[str, Any] = _read_modes_and_validity(quick_look_path, report_folder)
     if report_folder is not None and (report_folder / REPORT_PAGE).is_file():
-        results_of_analysis["report"] = report_folder / REPORT_PAGE
+        modes_and_validity["report"] = report_folder / REPORT_PAGE
     try:
         file_summary = read_summary(path)
     except SessionError as error:
@@ -141,7 +141,7 @@ def read_row(
             file_bytes,
             outcome="unreadable",
             problem=printable(str(error)),
-            **results_of_analysis,
+            **modes_and_validity,
         )
         return row, not isinstance(error, SessionAccessError)
     file_metadata, outcome_document = file_summary.metadata, file_summary.outcome or {}
@@ -175,35 +175,35 @@ def read_row(
         late=_count_of_key(outcome_document, "late"),
         lost=_count_of_key(outcome_document, "lost"),
         meta={
-            _cut_text(entry_name): _cut_text(entry_value)
+            _printable_cut_text(entry_name): _printable_cut_text(entry_value)
             if isinstance(entry_value, str)
             else entry_value
             for entry_name, entry_value in user_metadata
         },
         problem=file_summary.problem,
-        **results_of_analysis,
+        **modes_and_validity,
     )
     return row, True
 
 
-def _cut_text(text: str) -> str:
+def _printable_cut_text(text: str) -> str:
     """Return a printable text of at most 1000 characters."""
     return printable(text, _MAX_TEXT_CHARACTERS)
 
 
 def _text_of_key(key_texts: Mapping[str, str], key: str) -> str:
     """Return the text of a key, cut to 1000 characters; empty if there is none."""
-    return _cut_text(key_texts.get(key, "").strip())
+    return _printable_cut_text(key_texts.get(key, "").strip())
 
 
 def _count_of_key(key_texts: Mapping[str, str], key: str) -> int | None:
     """Return the count that a key states; None if it states no integer from 0 to 2**63 - 1."""
     count_text = key_texts.get(key, "")
     # More digits are not a count and exceed 64 bits.
-    is_count = (
+    is_count_text = (
         count_text.isascii() and count_text.isdigit() and len(count_text) <= _MAX_COUNT_DIGITS + 1
     )
-    return int(count_text) if is_count and int(count_text) < 2**63 else None
+    return int(count_text) if is_count_text and int(count_text) < 2**63 else None
 
 
 def _number_of_key(key_texts: Mapping[str, str], key: str) -> float | None:
@@ -218,7 +218,9 @@ def _number_of_key(key_texts: Mapping[str, str], key: str) -> float | None:
 # Modes
 
 
-def _modes_of_results(quick_look: Path | None, report_folder: Path | None) -> Document:
+def _read_modes_and_validity(
+    quick_look_path: Path | None, report_folder: Path | None
+) -> JsonObject:
     """Return the fields `modes` and `validity` of a row from a session's results.
 
     The report has priority over the quick look. If there are no results, the dictionary is empty.
@@ -228,16 +230,16 @@ def _modes_of_results(quick_look: Path | None, report_folder: Path | None) -> Do
             _read_json(report_folder / RESULTS_FILE), "headlines"
         ):
             if modes := usable_modes(_list_in_document(headline_document, "modes")):
-                return _with_validity(modes, headline_document)
-    quick_look_document = None if quick_look is None else read_quick_look(quick_look)
+                return _modes_and_validity(modes, headline_document)
+    quick_look_document = None if quick_look_path is None else read_quick_look(quick_look_path)
     return (
         {}
         if quick_look_document is None
-        else _with_validity(usable_modes(quick_look_document["modes"]), quick_look_document)
+        else _modes_and_validity(usable_modes(quick_look_document["modes"]), quick_look_document)
     )
 
 
-def _with_validity(modes: tuple[ReportedMode, ...], document: object) -> Document:
+def _modes_and_validity(modes: tuple[ReportedMode, ...], document: object) -> JsonObject:
     """Return the fields `modes` and `validity` of a row from modes and a document of results.
 
     The dictionary is empty if there are no modes.
@@ -258,8 +260,8 @@ def _read_json(path: Path) -> object:
 
 def _list_in_document(document: object, key: str) -> list[object]:
     """Return the list at a key of a JSON document; an empty list if there is none."""
-    listed_value = document.get(key) if isinstance(document, dict) else None
-    return listed_value if isinstance(listed_value, list) else []
+    key_value = document.get(key) if isinstance(document, dict) else None
+    return key_value if isinstance(key_value, list) else []
 
 
 def usable_modes(mode_list: object) -> tuple[ReportedMode, ...]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from rigd.errors import UserError
-from rigd.library._index import Index, StampedRow
+from rigd.library._index import LibraryIndex, StampedRow
 from rigd.library._row import (
     INCOMPLETE_SUFFIX,
     REPORT_FOLDER,
@@ -80,7 +80,7 @@ def list_sessions(
     >>> row.id, row.outcome, row.duration_s
     ('session', 'complete', 21.5)
     """
-    first_ns, last_ns = _time_ns(since, "since"), _time_ns(until, "until")
+    first_ns, last_ns = _parse_time_ns(since, "since"), _parse_time_ns(until, "until")
     requested_values = {
         "specimen": specimen,
         "operator": operator,
@@ -93,7 +93,7 @@ def list_sessions(
         if required_value
     }
 
-    def fits(row: SessionRow) -> bool:
+    def is_requested_row(row: SessionRow) -> bool:
         if any(
             getattr(row, field_name).casefold() != required_value
             for field_name, required_value in required_values.items()
@@ -105,7 +105,7 @@ def list_sessions(
             return False
         return not text or text.casefold() in _searchable_text(row)
 
-    matching_rows = [row for row in _read_rows(Path(folder), on_progress) if fits(row)]
+    matching_rows = [row for row in _read_rows(Path(folder), on_progress) if is_requested_row(row)]
     return sorted(matching_rows, key=lambda row: (row.start_utc_ns or 0, row.id), reverse=True)
 
 
@@ -116,7 +116,7 @@ def _searchable_text(row: SessionRow) -> str:
     return "\n".join((*row_texts, *user_metadata)).casefold()
 
 
-def _time_ns(given_time: str | datetime | None, argument_name: str) -> int | None:
+def _parse_time_ns(given_time: str | datetime | None, argument_name: str) -> int | None:
     """Return a time in ns since 1970; for a date, the start of the day or, if `until`, its end."""
     if given_time is None or given_time == "":
         return None
@@ -154,19 +154,19 @@ class _SessionFiles:
 
     def __init__(self, folder_entry: os.DirEntry[str]) -> None:
         self.path = Path(folder_entry.path)
-        self.stamp = _stamp_of(folder_entry.path)
+        self.stamp = _size_and_time_stamp(folder_entry.path)
         self.quick_look: Path | None = None
         self.report: Path | None = None
 
-    def add_results(self, quick_look: Path | None, report_folder: Path | None) -> None:
+    def add_results(self, quick_look_path: Path | None, report_folder: Path | None) -> None:
         """Add the paths of quick look and report, and append their sizes and times to the stamp."""
-        self.quick_look, self.report = quick_look, report_folder
-        if quick_look is not None:
-            self.stamp += f" look {_stamp_of(quick_look)}"
+        self.quick_look, self.report = quick_look_path, report_folder
+        if quick_look_path is not None:
+            self.stamp += f" look {_size_and_time_stamp(quick_look_path)}"
         if report_folder is not None:
             self.stamp += (
-                f" {report_folder.name} {_stamp_of(report_folder / RESULTS_FILE)}"
-                f" {_stamp_of(report_folder / REPORT_PAGE)}"
+                f" {report_folder.name} {_size_and_time_stamp(report_folder / RESULTS_FILE)}"
+                f" {_size_and_time_stamp(report_folder / REPORT_PAGE)}"
             )
 
 
@@ -176,7 +176,7 @@ def _read_rows(folder: Path, on_progress: Callable[[float], None] | None) -> lis
     The index is updated.
     """
     session_files = _find_session_files(folder)
-    folder_index = Index(folder)
+    folder_index = LibraryIndex(folder)
     indexed_rows = folder_index.read()
     all_rows: list[SessionRow] = []
     new_rows: dict[str, StampedRow] = {}
@@ -217,8 +217,8 @@ def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
     It raises LibraryError if the path is not a folder or the folder cannot be read.
     """
     session_files: dict[str, _SessionFiles] = {}
-    quick_looks: dict[str, Path] = {}
-    reports: dict[str, tuple[int, Path]] = {}
+    quick_looks_by_session: dict[str, Path] = {}
+    reports_by_session: dict[str, tuple[int, Path]] = {}
     try:
         with os.scandir(folder) as folder_entries:
             for folder_entry in folder_entries:
@@ -226,11 +226,13 @@ def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
                 if file_name.endswith((SESSION_SUFFIX, INCOMPLETE_SUFFIX)):
                     session_files[file_name] = _SessionFiles(folder_entry)
                 elif file_name.endswith(QUICK_LOOK_SUFFIX):
-                    quick_looks[file_name.removesuffix(QUICK_LOOK_SUFFIX)] = Path(folder_entry.path)
+                    quick_looks_by_session[file_name.removesuffix(QUICK_LOOK_SUFFIX)] = Path(
+                        folder_entry.path
+                    )
                 elif match := REPORT_FOLDER.fullmatch(file_name):
                     report_number = int((match[2] or "1")[:9])
-                    if report_number >= reports.get(match[1], (0, None))[0]:
-                        reports[match[1]] = report_number, Path(folder_entry.path)
+                    if report_number >= reports_by_session.get(match[1], (0, None))[0]:
+                        reports_by_session[match[1]] = report_number, Path(folder_entry.path)
     except OSError as error:
         raise LibraryError(
             f"{folder}: the folder cannot be listed ({error.strerror}); give a folder of session "
@@ -240,12 +242,13 @@ def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
         if file_name.endswith(SESSION_SUFFIX):
             session_name = file_name.removesuffix(SESSION_SUFFIX)
             files_of_session.add_results(
-                quick_looks.get(session_name), reports.get(session_name, (0, None))[1]
+                quick_looks_by_session.get(session_name),
+                reports_by_session.get(session_name, (0, None))[1],
             )
     return session_files
 
 
-def _stamp_of(path: str | os.PathLike[str]) -> str:
+def _size_and_time_stamp(path: str | os.PathLike[str]) -> str:
     """Return size and modification time of a file as text; empty if they cannot be read."""
     try:
         file_status = Path(path).stat()

@@ -73,26 +73,35 @@ def mode_trends(session_rows: Iterable[SessionRow]) -> list[ModeTrend]:
     """
     trends: list[list[TrendPoint]] = []
     for row in sorted(session_rows, key=lambda row: (row.start_utc_ns or 0, row.id)):
-        assigned_trends: set[int] = set()
+        assigned_trend_indices: set[int] = set()
         for mode in row.modes:
-            distances = {
+            log_frequency_distances = {
                 trend_index: abs(log(mode.frequency_hz.value / points[-1].frequency_hz.value))
                 for trend_index, points in enumerate(trends)
-                if trend_index not in assigned_trends
+                if trend_index not in assigned_trend_indices
             }
-            nearest_trend = min(distances, key=distances.__getitem__, default=None)
-            if nearest_trend is None or distances[nearest_trend] > _MAX_LOG_FREQUENCY_RATIO:
-                nearest_trend = len(trends)
+            nearest_trend_index = min(
+                log_frequency_distances, key=log_frequency_distances.__getitem__, default=None
+            )
+            if (
+                nearest_trend_index is None
+                or log_frequency_distances[nearest_trend_index] > _MAX_LOG_FREQUENCY_RATIO
+            ):
+                nearest_trend_index = len(trends)
                 trends.append([])
-            assigned_trends.add(nearest_trend)
-            points = trends[nearest_trend]
-            changes: tuple[Change | None, Change | None] = (None, None)
+            assigned_trend_indices.add(nearest_trend_index)
+            points = trends[nearest_trend_index]
+            frequency_and_damping_change: tuple[Change | None, Change | None] = (None, None)
             if points:
                 first_point = points[0]
-                changes = (
+                frequency_and_damping_change = (
                     change_between(first_point.frequency_hz, mode.frequency_hz),
                     change_between(first_point.damping_ratio, mode.damping_ratio),
                 )
-            points.append(TrendPoint(row, mode.frequency_hz, mode.damping_ratio, *changes))
+            points.append(
+                TrendPoint(
+                    row, mode.frequency_hz, mode.damping_ratio, *frequency_and_damping_change
+                )
+            )
     trends.sort(key=lambda points: points[0].frequency_hz.value)
     return [ModeTrend(tuple(points)) for points in trends]

@@ -41,7 +41,7 @@ class DrawingStream:
     def __init__(self, server_program: RerunServer) -> None:
         self._server_program = server_program
         self._recording_id = ""
-        self._frame: Callable[[], Iterable[Drawing]] = tuple
+        self._make_frame_drawings: Callable[[], Iterable[Drawing]] = tuple
         self._stream: RecordingStream | None = None
         self._server: int | None = None
         self._server_with_layout: int | None = None
@@ -50,31 +50,33 @@ class DrawingStream:
         self.connections = 0
         self.stalled = False
 
-    def begin(self, recording_id: str, frame_drawings: "Callable[[], Iterable[Drawing]]") -> None:
+    def begin(
+        self, recording_id: str, make_frame_drawings: "Callable[[], Iterable[Drawing]]"
+    ) -> None:
         """Start a new Rerun recording for a session; open viewers switch to it.
 
-        `frame_drawings` returns the functions that draw first on each connection.
+        `make_frame_drawings` returns the functions that draw first on each connection.
         """
-        self._recording_id, self._frame = recording_id, frame_drawings
+        self._recording_id, self._make_frame_drawings = recording_id, make_frame_drawings
 
     def ready(self) -> bool:
         """Connect to the Rerun server if necessary, and return whether it accepts drawings now."""
         if not self._server_program.poll():
-            self._discard()
+            self._discard_connection()
             return False
         assert self._server_program.address is not None
         if self._server != self._server_program.address.server:
-            self._discard()
+            self._discard_connection()
         if self.stalled and not self._has_recovered():
             return False
         if self._stream is not None and self._stream.get_recording_id() != self._recording_id:
-            self._close()
+            self._close_connection()
         if (
             self._stream is None
             and self._recording_id
             and self._server_program.accepts_connections()
         ):
-            self._connect()
+            self._connect_to_server()
         return self._stream is not None and not self.stalled
 
     def send(self, drawings: "Iterable[Drawing]") -> bool:
@@ -84,14 +86,14 @@ class DrawingStream:
         """
         if self._stream is None:
             return False
-        for draw_item in drawings:
-            draw_item(self._stream)
-        self._flush(_FLUSH_TIMEOUT_S)
+        for draw in drawings:
+            draw(self._stream)
+        self._flush_drawings(_FLUSH_TIMEOUT_S)
         return self._stream is not None
 
     def _has_recovered(self) -> bool:
         """Return whether a stalled server accepts drawings again; kill it if that takes long."""
-        self._flush(_STALLED_FLUSH_TIMEOUT_S)
+        self._flush_drawings(_STALLED_FLUSH_TIMEOUT_S)
         if self.stalled:
             self._stalled_polls += 1
             if self._stalled_polls > _MAX_STALLED_POLLS:
@@ -99,7 +101,7 @@ class DrawingStream:
         # After a broken connection the next call first checks the state of the server.
         return self._stream is not None and not self.stalled
 
-    def _flush(self, timeout_s: float) -> None:
+    def _flush_drawings(self, timeout_s: float) -> None:
         """Flush the SDK's buffer, and detect a stalled server or a broken connection."""
         assert self._stream is not None
         try:
@@ -109,12 +111,12 @@ class DrawingStream:
                 self.stalled = True
             else:
                 # The connection is broken, and a stream cannot connect again.
-                self._discard()
+                self._discard_connection()
         else:
             self.stalled = False
             self._stalled_polls = 0
 
-    def _close(self) -> None:
+    def _close_connection(self) -> None:
         """Close the connection to the Rerun server after all drawings were sent."""
         assert self._stream is not None
         # The SDK's clean-up would wait for streams that are still closing, and they for it.
@@ -124,7 +126,7 @@ class DrawingStream:
         _start_thread(_close_stream, [self._stream], releases_resources)
         self._stream = None
 
-    def _discard(self) -> None:
+    def _discard_connection(self) -> None:
         """Close the connection to a Rerun server that has ended or was replaced."""
         if self._stream is not None:
             # In the background, because the SDK tries to reach the server for up to 10 s.
@@ -138,7 +140,7 @@ class DrawingStream:
         self.stalled = False
         self._stalled_polls = 0
 
-    def _connect(self) -> None:
+    def _connect_to_server(self) -> None:
         """Connect to the present server, and send the first drawings of the session."""
         import rerun as rr
 
@@ -152,9 +154,9 @@ class DrawingStream:
         self.connections += 1
         has_layout = self._server_with_layout == self._server
         drawing_target: Any = _StreamWithoutLayout(rerun_stream) if has_layout else rerun_stream
-        for draw_item in self._frame():
-            draw_item(drawing_target)
-        self._flush(_FLUSH_TIMEOUT_S)
+        for draw in self._make_frame_drawings():
+            draw(drawing_target)
+        self._flush_drawings(_FLUSH_TIMEOUT_S)
         if self._stream is not None:
             self._server_with_layout = self._server
 
@@ -183,14 +185,14 @@ def _start_thread(function: Callable[..., None], *arguments: object) -> threadin
     return new_thread
 
 
-def _close_stream(streams: "list[RecordingStream]", release: bool) -> None:
+def _close_stream(streams: "list[RecordingStream]", releases_resources: bool) -> None:
     """Disconnect the Rerun stream in a list of one, and remove it from the list.
 
-    With `release` the SDK also releases the stream's resources.
+    With `releases_resources` the SDK also releases the stream's resources.
     """
     from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
     with contextlib.suppress(RuntimeError):
         streams.pop().disconnect()
-        if release:
+        if releases_resources:
             flush_and_cleanup_orphaned_recordings()

@@ -24,21 +24,21 @@ from rigd.live.address import LOOPBACK, LiveAddress
 
 PAGE_PORT: Final = 9090
 """Preferred port of the page, Rerun's default."""
-_STATE_DOCUMENT: Final = "live.json"
+_SERVER_STATE_DOCUMENT: Final = "live.json"
 """Name of the document that identifies the present server."""
 _SERVED_FILES: Final = frozenset(  # Names of all documents that the page serves
     {
-        _STATE_DOCUMENT,
+        _SERVER_STATE_DOCUMENT,
         *("", "re_viewer.js", "re_viewer_bg.wasm", "sw.js", "favicon.ico", "apple-touch-icon.png"),
     }
 )
-_BLOCK_BYTES: Final = 65_536
+_FORWARDED_BLOCK_BYTES: Final = 65_536
 """Number of bytes of Rerun's files that are forwarded at once."""
 _REQUEST_TIMEOUT_S: Final = 10.0
 """Timeout in seconds of a browser's request and of Rerun's reply."""
 _POLL_PERIOD_S: Final = 0.1
 """Interval in seconds of the server's polls, and pause after a failed connection."""
-_MAX_CONNECTION_S: Final = 60.0
+_MAX_CONNECTION_DURATION_S: Final = 60.0
 """Longest duration of a connection in seconds: the viewer has 40 MB, and a tunnel may be slow."""
 _MAX_CONNECTIONS: Final = 16
 """Largest number of simultaneous connections."""
@@ -47,22 +47,22 @@ _PERMITTED_HOSTS: Final = frozenset({LOOPBACK, "localhost"})
 
 Other names are refused, since any page on the internet can resolve its own name to loopback."""
 
-_LOOPBACK_SOURCES: Final = f"http://{LOOPBACK}:* http://localhost:*"
+_LOOPBACK_POLICY_SOURCES: Final = f"http://{LOOPBACK}:* http://localhost:*"
 """Sources in the content security policy that stand for servers on this computer."""
-_SECURITY_POLICY: Final = "; ".join(  # Content security policy of the page
+_CONTENT_SECURITY_POLICY: Final = "; ".join(  # Content security policy of the page
     (
         "default-src 'none'",
         "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'",
         "style-src 'unsafe-inline'",
         "img-src 'self' data: blob:",
-        f"connect-src 'self' {_LOOPBACK_SOURCES}",
+        f"connect-src 'self' {_LOOPBACK_POLICY_SOURCES}",
         "worker-src 'self' blob:",
         "base-uri 'none'",
         "form-action 'none'",
         "frame-ancestors 'none'",
     )
 )
-_REMOTE_LINK: Final = re.compile(r"<link\s[^>]*https?://[^>]*>")
+_REMOTE_LINK_PATTERN: Final = re.compile(r"<link\s[^>]*https?://[^>]*>")
 """Pattern of links in Rerun's page to other computers."""
 _RELOAD_SCRIPT: Final = """
     <script>
@@ -166,7 +166,7 @@ class _PageServer(ThreadingHTTPServer):
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
         """Serve a connection, and close it if it lasts too long."""
-        deadline_timer = threading.Timer(_MAX_CONNECTION_S, _close_connection, (request,))
+        deadline_timer = threading.Timer(_MAX_CONNECTION_DURATION_S, _close_connection, (request,))
         deadline_timer.daemon = True
         deadline_timer.start()
         try:
@@ -198,23 +198,25 @@ class _PageHandler(BaseHTTPRequestHandler):
 
     def _send_document(self) -> None:
         """Send the requested document, a redirection, or an error."""
-        url = urllib.parse.urlsplit(self.path)
-        document_name, address = url.path.lstrip("/"), self.server.get_address()
+        requested_url = urllib.parse.urlsplit(self.path)
+        document_name, address = requested_url.path.lstrip("/"), self.server.get_address()
         if document_name not in _SERVED_FILES:
             self._send_text(HTTPStatus.NOT_FOUND, "Not found.")
         elif address is None:
-            self._send_retry()
-        elif document_name == _STATE_DOCUMENT:
-            self._send(json.dumps({"server": address.server}).encode(), "application/json")
-        elif not document_name and "url" not in urllib.parse.parse_qs(url.query):
+            self._send_retry_request()
+        elif document_name == _SERVER_STATE_DOCUMENT:
+            self._send_document_body(
+                json.dumps({"server": address.server}).encode(), "application/json"
+            )
+        elif not document_name and "url" not in urllib.parse.parse_qs(requested_url.query):
             # Relative, because the browser may use a tunnel on another port.
             self.send_response(HTTPStatus.FOUND)
             self.send_header("Location", f"/?{urllib.parse.urlsplit(address.viewer_url).query}")
             self.end_headers()
         else:
-            self._forward(document_name)
+            self._forward_rerun_file(document_name)
 
-    def _forward(self, file_name: str) -> None:
+    def _forward_rerun_file(self, file_name: str) -> None:
         """Send a file that Rerun's own page server provides, without links to other computers."""
         rerun_connection = http.client.HTTPConnection(
             LOOPBACK, self.server.get_rerun_port(), timeout=_REQUEST_TIMEOUT_S
@@ -224,7 +226,9 @@ class _PageHandler(BaseHTTPRequestHandler):
             rerun_reply = rerun_connection.getresponse()
             content_type = rerun_reply.headers.get("Content-Type", "application/octet-stream")
             if not file_name:
-                self._send(confine_to_loopback(rerun_reply.read().decode()).encode(), content_type)
+                self._send_document_body(
+                    confine_to_loopback(rerun_reply.read().decode()).encode(), content_type
+                )
                 return
             self.send_response(rerun_reply.status)
             self.send_header("Content-Type", content_type)
@@ -232,16 +236,16 @@ class _PageHandler(BaseHTTPRequestHandler):
             if (content_length := rerun_reply.headers.get("rerun-final-length")) is not None:
                 self.send_header("Content-Length", content_length)
             self._end_headers()
-            while file_block := rerun_reply.read(_BLOCK_BYTES):
+            while file_block := rerun_reply.read(_FORWARDED_BLOCK_BYTES):
                 self.wfile.write(file_block)
         except (OSError, http.client.HTTPException):
             # The server is being replaced, or the browser is gone.
             with suppress(OSError):
-                self._send_retry()
+                self._send_retry_request()
         finally:
             rerun_connection.close()
 
-    def _send_retry(self) -> None:
+    def _send_retry_request(self) -> None:
         """Send an error after which the browser repeats its request in a second."""
         self._send_text(
             HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", asks_retry=True
@@ -256,7 +260,7 @@ class _PageHandler(BaseHTTPRequestHandler):
         self._end_headers()
         self.wfile.write(text.encode())
 
-    def _send(self, body: bytes, content_type: str) -> None:
+    def _send_document_body(self, body: bytes, content_type: str) -> None:
         """Send a document with its content type; no cache may store it."""
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", content_type)
@@ -267,7 +271,7 @@ class _PageHandler(BaseHTTPRequestHandler):
 
     def _end_headers(self) -> None:
         """Send the content security policy as the last header."""
-        self.send_header("Content-Security-Policy", _SECURITY_POLICY)
+        self.send_header("Content-Security-Policy", _CONTENT_SECURITY_POLICY)
         self.end_headers()
 
 
@@ -277,6 +281,6 @@ def _close_connection(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-def confine_to_loopback(page: str) -> str:
+def confine_to_loopback(page_html: str) -> str:
     """Return Rerun's HTML page without links to other computers, with the reload script added."""
-    return _REMOTE_LINK.sub("", page).replace("</body>", f"{_RELOAD_SCRIPT}</body>", 1)
+    return _REMOTE_LINK_PATTERN.sub("", page_html).replace("</body>", f"{_RELOAD_SCRIPT}</body>", 1)

@@ -33,17 +33,17 @@ _OFFLINE_ENVIRONMENT: Mapping[
     "RUST_LOG": "info",
     "NO_COLOR": "1",
 }
-_GRPC_PORT_LINE = re.compile(rf"gRPC connections on {re.escape(LOOPBACK)}:(\d+)")
+_GRPC_PORT_PATTERN = re.compile(rf"gRPC connections on {re.escape(LOOPBACK)}:(\d+)")
 """Pattern of the log line with the port for native viewers."""
-_PAGE_PORT_LINE = re.compile(rf"web-viewer at http://{re.escape(LOOPBACK)}:(\d+)")
+_PAGE_PORT_PATTERN = re.compile(rf"web-viewer at http://{re.escape(LOOPBACK)}:(\d+)")
 """Pattern of the log line with the port of the page."""
-_NO_GRAPHICS_LINE = re.compile(  # Pattern of log lines about missing graphics
+_NO_GRAPHICS_PATTERN = re.compile(  # Pattern of log lines about missing graphics
     # Neither Vulkan nor OpenGL, or only OpenGL, which is incomplete in Mesa's software renderer.
     "[Nn]o (suitable )?(graphics|wgpu) adapter|Failed to get render context"
 )
 _LOG_WAIT_S: Final = 0.5
 """Seconds to wait for further log lines of a running program."""
-_LAST_LOG_WAIT_S: Final = 10.0
+_MAX_LOG_END_WAIT_S: Final = 10.0
 """Longest time in seconds to read the log of an ended program to its end."""
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 """Option of prctl that sets the signal which a process receives when its parent ends."""
@@ -62,10 +62,10 @@ class RerunProgram:
     def __init__(
         self, rerun_options: Sequence[str], extra_environment: Mapping[str, str] | None = None
     ) -> None:
-        command = [_program_path(), *("--bind", LOOPBACK), *rerun_options]
+        rerun_command = [_rerun_program_path(), *("--bind", LOOPBACK), *rerun_options]
         try:
             self._process = subprocess.Popen(
-                command,
+                rerun_command,
                 env={
                     **without_rerun_variables(os.environ),
                     **_OFFLINE_ENVIRONMENT,
@@ -79,10 +79,10 @@ class RerunProgram:
                 preexec_fn=_die_with_parent,  # noqa: PLW1509 - one system call, no lock taken
             )
         except OSError as error:
-            raise RerunError(f"{command[0]}: cannot be run: {error.strerror}.") from None
+            raise RerunError(f"{rerun_command[0]}: cannot be run: {error.strerror}.") from None
         self._ports: dict[re.Pattern[str], int] = {}
         self._last_lines: collections.deque[str] = collections.deque(maxlen=3)
-        self._without_graphics = False
+        self._lacks_graphics = False
         # Read to the end: a program blocks if its output fills the pipe.
         self._reader = threading.Thread(target=self._read_log, daemon=True)
         self._reader.start()
@@ -105,12 +105,12 @@ class RerunProgram:
     @property
     def grpc_port(self) -> int:
         """Port of Rerun's server for native viewers, or 0 if it is not known yet."""
-        return self._ports.get(_GRPC_PORT_LINE, 0)
+        return self._ports.get(_GRPC_PORT_PATTERN, 0)
 
     @property
     def page_port(self) -> int:
         """Port of Rerun's page for browsers, or 0 if it is unknown or there is no page."""
-        return self._ports.get(_PAGE_PORT_LINE, 0)
+        return self._ports.get(_PAGE_PORT_PATTERN, 0)
 
     @property
     def last_log_lines(self) -> str:
@@ -119,10 +119,10 @@ class RerunProgram:
         return " ".join(self._last_lines) or "it wrote no log"
 
     @property
-    def without_graphics(self) -> bool:
+    def lacks_graphics(self) -> bool:
         """Whether the program's log reports that the computer has no usable graphics."""
         self._wait_for_log()
-        return self._without_graphics
+        return self._lacks_graphics
 
     def kill(self) -> None:
         """Kill Rerun's program, which has nothing to save."""
@@ -132,7 +132,7 @@ class RerunProgram:
     def _wait_for_log(self) -> None:
         """Wait a moment for more log lines, or until an ended program's log is read to its end."""
         # After the end of the program the thread reads the log to its end.
-        self._reader.join(timeout=_LOG_WAIT_S if self.running else _LAST_LOG_WAIT_S)
+        self._reader.join(timeout=_LOG_WAIT_S if self.running else _MAX_LOG_END_WAIT_S)
 
     def _read_log(self) -> None:
         """Read the program's log to its end, for ports and errors (run in a thread)."""
@@ -141,13 +141,13 @@ class RerunProgram:
             for log_line in log:
                 self._last_lines.append(log_line.strip()[:200])
                 # A backtrace follows this line, so it is not among the last lines.
-                self._without_graphics |= _NO_GRAPHICS_LINE.search(log_line) is not None
-                for port_pattern in (_GRPC_PORT_LINE, _PAGE_PORT_LINE):
+                self._lacks_graphics |= _NO_GRAPHICS_PATTERN.search(log_line) is not None
+                for port_pattern in (_GRPC_PORT_PATTERN, _PAGE_PORT_PATTERN):
                     if port_match := port_pattern.search(log_line):
                         self._ports[port_pattern] = int(port_match[1])
 
 
-def _program_path() -> str:
+def _rerun_program_path() -> str:
     """Return the path of Rerun's program, or raise RerunError if it is not installed."""
     # The `rerun` command on the path is a script: killing it would leave the program running.
     package_spec = importlib.util.find_spec("rerun_cli")

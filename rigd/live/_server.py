@@ -18,9 +18,9 @@ GRPC_PORT: Final = 9876
 """Preferred port of the server, Rerun's default.
 
 Viewers use it by default, and tunnels can forward it in advance."""
-_SERVER_MEMORY: Final = "16MiB"
+_SERVER_MEMORY_LIMIT: Final = "16MiB"
 """Size of the data that the server stores for viewers that connect late: about 80 s of signals."""
-_MAX_SESSIONS: Final = 20
+_MAX_SESSIONS_PER_SERVER: Final = 20
 """Number of sessions after which a server is replaced.
 
 Each session leaves about 300 kB of layout and charts in the server."""
@@ -39,10 +39,10 @@ class RerunServer:
     Rerun's program cannot be started.
     """
 
-    def __init__(self, rig: str) -> None:
+    def __init__(self, rig_name: str) -> None:
         self.address: LiveAddress | None = None
         self._announced_address: LiveAddress | None = None
-        self._rig = rig
+        self._rig = rig_name
         self._grpc_port = free_port(GRPC_PORT)
         self._page = serve_page(lambda: self.address, lambda: self._program.page_port)
         self._start_program()
@@ -75,11 +75,11 @@ class RerunServer:
                 self._announce()
             return True
         self.address = None
-        age_s = time.monotonic() - self._started_s
-        if age_s > _START_TIMEOUT_S:
+        program_age_s = time.monotonic() - self._started_s
+        if program_age_s > _START_TIMEOUT_S:
             # The program mistook a listener on its port for another Rerun server.
             program.kill()
-        if age_s > _MIN_RESTART_INTERVAL_S and not program.running:
+        if program_age_s > _MIN_RESTART_INTERVAL_S and not program.running:
             self._restart()
         return False
 
@@ -97,7 +97,7 @@ class RerunServer:
         Rerun's server never frees the data of a session.
         """
         self._sessions += 1
-        if self._sessions > _MAX_SESSIONS:
+        if self._sessions > _MAX_SESSIONS_PER_SERVER:
             self.kill_server()
 
     def kill_server(self) -> None:
@@ -132,7 +132,7 @@ class RerunServer:
                 "--serve-web",
                 *("--port", str(self._grpc_port)),
                 *("--web-viewer-port", "0"),
-                *("--server-memory-limit", _SERVER_MEMORY),
+                *("--server-memory-limit", _SERVER_MEMORY_LIMIT),
             )
         )
 

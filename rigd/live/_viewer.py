@@ -12,7 +12,7 @@ from rigd.live._server import GRPC_PORT, free_port
 from rigd.live.address import LiveAddress, proxy_url
 from rigd.runtime.addresses import runtime_folder
 
-_FILE_VIEWER_MEMORY: Final = "4GiB"
+_FILE_VIEWER_MEMORY_LIMIT: Final = "4GiB"
 """Memory of a viewer for a file, above which the oldest data are dropped.
 
 It is enough for a session of some hours."""
@@ -56,16 +56,16 @@ class _Window(_RerunContext):
     """Window of Rerun's viewer, which neither uses nor changes the user's settings of Rerun.
 
     `content_options` are the command-line arguments that state what it shows first, `memory_limit`
-    is the limit above which the oldest data are dropped, and `scratch` is a folder for files that
-    Rerun leaves when it is killed.
+    is the limit above which the oldest data are dropped, and `scratch_folder` is a folder for files
+    that Rerun leaves when it is killed.
     """
 
     def __init__(
         self,
         content_options: tuple[str, ...],
         memory_limit: str,
-        scratch: Path,
-        options: tuple[str, ...],
+        scratch_folder: Path,
+        rerun_options: tuple[str, ...],
     ) -> None:
         self._program = RerunProgram(
             (
@@ -73,15 +73,15 @@ class _Window(_RerunContext):
                 *("--port", "0"),
                 *("--memory-limit", memory_limit),
                 "--hide-welcome-screen",
-                *options,
+                *rerun_options,
             ),
-            {"XDG_DATA_HOME": str(runtime_folder() / "viewer"), "TMPDIR": str(scratch)},
+            {"XDG_DATA_HOME": str(runtime_folder() / "viewer"), "TMPDIR": str(scratch_folder)},
         )
 
     @property
-    def fault(self) -> str:
+    def closing_reason(self) -> str:
         """Sentence for the operator on why the window closed, if the user did not close it."""
-        if self._program.without_graphics:
+        if self._program.lacks_graphics:
             return (
                 "The window cannot be drawn: this computer has no Vulkan driver, which Rerun's "
                 "viewer needs. Install one; on Debian and Ubuntu the package mesa-vulkan-drivers "
@@ -97,9 +97,9 @@ class FileWindow(_Window):
     ----------
     path
         Path of the recording file.
-    scratch
+    scratch_folder
         Folder for files that Rerun leaves when it is killed.
-    options
+    rerun_options
         Further options of Rerun's command line.
 
     Raises
@@ -108,8 +108,12 @@ class FileWindow(_Window):
         If Rerun's program cannot be started.
     """
 
-    def __init__(self, path: Path, scratch: Path, options: tuple[str, ...] = ()) -> None:
-        super().__init__((str(path.absolute()),), _FILE_VIEWER_MEMORY, scratch, options)
+    def __init__(
+        self, path: Path, scratch_folder: Path, rerun_options: tuple[str, ...] = ()
+    ) -> None:
+        super().__init__(
+            (str(path.absolute()),), _FILE_VIEWER_MEMORY_LIMIT, scratch_folder, rerun_options
+        )
 
 
 class PageOfFile(_RerunContext):
@@ -119,7 +123,7 @@ class PageOfFile(_RerunContext):
     ----------
     path
         Path of the recording file.
-    scratch
+    scratch_folder
         Folder for files that Rerun leaves when it is killed.
 
     Attributes
@@ -133,9 +137,9 @@ class PageOfFile(_RerunContext):
         If Rerun's program cannot be started, or accepts no connections.
     """
 
-    def __init__(self, path: Path, scratch: Path) -> None:
-        self._file, self._scratch = path, scratch
-        self._serve(free_port(GRPC_PORT))
+    def __init__(self, path: Path, scratch_folder: Path) -> None:
+        self._file, self._scratch = path, scratch_folder
+        self._start_server(free_port(GRPC_PORT))
         try:
             self._await_server()
             self._page = serve_page(lambda: self.address, lambda: self._program.page_port)
@@ -151,7 +155,7 @@ class PageOfFile(_RerunContext):
         self._page.close()
         super().close()
 
-    def _serve(self, port: int) -> None:
+    def _start_server(self, port: int) -> None:
         """Start Rerun's program as a server of the recording on a port."""
         self._program = RerunProgram(
             (
@@ -159,7 +163,7 @@ class PageOfFile(_RerunContext):
                 "--serve-web",
                 *("--port", str(port)),
                 *("--web-viewer-port", "0"),
-                *("--server-memory-limit", _FILE_VIEWER_MEMORY),
+                *("--server-memory-limit", _FILE_VIEWER_MEMORY_LIMIT),
             ),
             {"TMPDIR": str(self._scratch)},
         )
@@ -167,14 +171,14 @@ class PageOfFile(_RerunContext):
     def _await_server(self) -> None:
         """Wait until the server accepts connections; use another port if this one is taken."""
         deadline_s = time.monotonic() + _START_TIMEOUT_S
-        any_port = False
+        uses_any_port = False
         while not (self._program.grpc_port and self._program.page_port):
             if not self._program.running:
-                if any_port or self._program.grpc_port:
+                if uses_any_port or self._program.grpc_port:
                     raise RerunError(f"The Rerun server ended: {self._program.last_log_lines}.")
                 # Most likely another process has taken the port.
-                any_port = True
-                self._serve(0)
+                uses_any_port = True
+                self._start_server(0)
             if time.monotonic() > deadline_s:
                 raise RerunError(
                     f"The Rerun server does not answer: {self._program.last_log_lines}."
@@ -184,7 +188,7 @@ class PageOfFile(_RerunContext):
 
 # Window on a live view
 
-_LIVE_VIEWER_MEMORY: Final = "2GiB"
+_LIVE_VIEWER_MEMORY_LIMIT: Final = "2GiB"
 """Memory of a viewer for live views, above which the oldest data are dropped.
 
 It is limited because the same computer may be running the loop."""
@@ -201,9 +205,9 @@ class Viewer(_Window):
     ----------
     address
         First live view to show.
-    scratch
+    scratch_folder
         Folder for files that Rerun leaves when it is killed.
-    options
+    rerun_options
         Further options of Rerun's command line.
 
     Raises
@@ -212,11 +216,13 @@ class Viewer(_Window):
         If Rerun's program cannot be started.
     """
 
-    def __init__(self, address: LiveAddress, scratch: Path, options: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, address: LiveAddress, scratch_folder: Path, rerun_options: tuple[str, ...] = ()
+    ) -> None:
         self._connections = 0
         self._connecting: threading.Thread | None = None
         content_options = ("--connect", self._next_url(address))
-        super().__init__(content_options, _LIVE_VIEWER_MEMORY, scratch, options)
+        super().__init__(content_options, _LIVE_VIEWER_MEMORY_LIMIT, scratch_folder, rerun_options)
 
     @property
     def pid(self) -> int:
@@ -234,9 +240,9 @@ class Viewer(_Window):
         return self._program.last_log_lines
 
     @property
-    def without_graphics(self) -> bool:
+    def lacks_graphics(self) -> bool:
         """Whether the viewer's log reports that the computer has no usable graphics."""
-        return self._program.without_graphics
+        return self._program.lacks_graphics
 
     @property
     def control_url(self) -> str:
@@ -253,15 +259,17 @@ class Viewer(_Window):
         if not self.control_url or (self._connecting and self._connecting.is_alive()):
             return False
         self._connections += 1
-        url = self._next_url(address)
-        successes: list[bool] = []
+        server_url = self._next_url(address)
+        switch_successes: list[bool] = []
         # In a thread, because a frozen window never responds, and the wait would block Ctrl-C.
         self._connecting = threading.Thread(
-            target=_switch_server, args=(self.control_url, url, successes), daemon=True
+            target=_switch_server,
+            args=(self.control_url, server_url, switch_successes),
+            daemon=True,
         )
         self._connecting.start()
         self._connecting.join(_SWITCH_TIMEOUT_S)
-        return any(successes)
+        return any(switch_successes)
 
     def _next_url(self, live_address: LiveAddress) -> str:
         """Return a URL of the live view's server that differs from the previous one."""
@@ -270,7 +278,7 @@ class Viewer(_Window):
         )
 
 
-def _switch_server(control_url: str, url: str, successes: list[bool]) -> None:
+def _switch_server(control_url: str, server_url: str, switch_successes: list[bool]) -> None:
     """Switch a viewer to the server at `url`, and append True to `successes` on success."""
     from rerun.experimental import ViewerClient
 
@@ -285,8 +293,8 @@ def _switch_server(control_url: str, url: str, successes: list[bool]) -> None:
         if earlier_recordings:
             viewer_client.close(store_ids=earlier_recordings)
         with contextlib.suppress(ConnectionError):  # the viewer received nothing from this server
-            viewer_client.close(url)
-        viewer_client.open(url)
+            viewer_client.close(server_url)
+        viewer_client.open(server_url)
     except (OSError, RuntimeError):  # the viewer is busy or about to end
         return
-    successes.append(True)
+    switch_successes.append(True)

@@ -91,17 +91,17 @@ class LiveAddress:
         return process_start_ticks(self.pid) == self.born
 
 
-def proxy_url(host: str, grpc_port: int) -> str:
+def proxy_url(host_name: str, grpc_port: int) -> str:
     """Return the URL at which Rerun's SDK and native viewers connect to a Rerun server.
 
     Parameters
     ----------
-    host
+    host_name
         Host name or IP address of the server's computer.
     grpc_port
         Port of the server for native viewers.
     """
-    return f"rerun+http://{host}:{grpc_port}/proxy"
+    return f"rerun+http://{host_name}:{grpc_port}/proxy"
 
 
 def announce(address: LiveAddress) -> None:
@@ -126,9 +126,9 @@ def withdraw(address: LiveAddress) -> None:
         address_path.unlink(missing_ok=True)
 
 
-def find(rig: str) -> LiveAddress | None:
+def find(rig_name: str) -> LiveAddress | None:
     """Return the address of a rig's live view, or None if the rig has no running view."""
-    address = _read_address_file(_address_path(rig))
+    address = _read_address_file(_address_path(rig_name))
     return address if address is not None and address.alive else None
 
 
@@ -138,9 +138,9 @@ def running() -> list[LiveAddress]:
     return [address for address in live_addresses if address is not None and address.alive]
 
 
-def _address_path(rig: str) -> Path:
+def _address_path(rig_name: str) -> Path:
     """Return the path of a rig's address file."""
-    return runtime_folder() / f"{_FILE_PREFIX}{file_name(rig)}{_FILE_SUFFIX}"
+    return runtime_folder() / f"{_FILE_PREFIX}{file_name(rig_name)}{_FILE_SUFFIX}"
 
 
 def _read_address_file(path: Path) -> LiveAddress | None:
@@ -153,16 +153,16 @@ def _read_address_file(path: Path) -> LiveAddress | None:
         address = LiveAddress(**address_fields)
     except TypeError:
         return None
-    return address if _is_valid(address_fields) else None
+    return address if _are_valid_fields(address_fields) else None
 
 
-def _is_valid(address_fields: dict[str, object]) -> bool:
+def _are_valid_fields(address_fields: dict[str, object]) -> bool:
     """Return whether the fields read from an address file have valid values."""
-    rig = address_fields.pop("rig")
+    rig_name = address_fields.pop("rig")
     port_numbers = (address_fields["grpc_port"], address_fields["page_port"])
     return (
-        isinstance(rig, str)
-        and rig.isprintable()
+        isinstance(rig_name, str)
+        and rig_name.isprintable()
         and all(type(process_number) is int for process_number in address_fields.values())
         and all(
             0 < port_number < 1 << 16

@@ -51,22 +51,22 @@ if TYPE_CHECKING:
     from rigd.view import Drawing
 
 
-_SEND_PERIOD_S: Final = 1 / 15
+_DRAWING_INTERVAL_S: Final = 1 / 15
 """Interval in seconds at which drawings are sent during a session.
 
 The picture is smooth at this interval. A shorter one would cost more, since the cost grows with the
 number of messages."""
-_IDLE_PERIOD_S: Final = 1.0
+_IDLE_POLL_INTERVAL_S: Final = 1.0
 """Interval in seconds at which the publisher polls its server between sessions."""
-_CATCH_UP_S: Final = 0.2
+_MIN_CATCH_UP_SAMPLES_S: Final = 0.2
 """Duration in seconds of the samples read at once from which the next reading follows at once."""
-_MAX_QUEUED_S: Final = 10.0
+_MAX_QUEUED_SAMPLES_S: Final = 10.0
 """Seconds of samples that are queued for a stalled server."""
 _WATCHDOG_TIMEOUT_S: Final = 20
 """Seconds without progress after which the system kills the publisher."""
-_LAST_MESSAGES_S: Final = 0.3
+_LAST_MESSAGES_WAIT_S: Final = 0.3
 """Seconds for the last messages to reach the viewers."""
-_MAX_ORPHANED_S: Final = 4.0
+_MAX_ORPHANED_SESSION_S: Final = 4.0
 """Longest time in seconds for which a session without supervisor is shown.
 
 Such a session ends in a fraction of this time."""
@@ -79,8 +79,8 @@ def main() -> None:
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGALRM,))
     prepare_sdk_environment()
-    parent = SupervisorConnection()
-    job: LiveJob = parent.receive_job()
+    supervisor_connection = SupervisorConnection()
+    job: LiveJob = supervisor_connection.receive_job()
     channels = attach_channels(job.channels)
     try:
         server_program = RerunServer(job.rig)
@@ -88,11 +88,11 @@ def main() -> None:
 
         server_program.wait()
     except (RerunError, ImportError) as error:
-        parent.send(ProcessFailed(str(error)))
+        supervisor_connection.send(ProcessFailed(str(error)))
         raise SystemExit(1) from None
-    publisher = _Publisher(parent, channels, server_program)
+    publisher = _Publisher(supervisor_connection, channels, server_program)
     publisher.serve()
-    publisher.linger(job.linger_s)
+    publisher.keep_view_open(job.linger_s)
     server_program.close()
     # Without the interpreter's clean-up, in which the SDK may wait for an unresponsive server.
     os._exit(0)
@@ -102,9 +102,12 @@ class _Publisher:
     """Main loop of the publisher: receives sessions from the supervisor and shows them."""
 
     def __init__(
-        self, parent: SupervisorConnection, channels: Channels, server_program: RerunServer
+        self,
+        supervisor_connection: SupervisorConnection,
+        channels: Channels,
+        server_program: RerunServer,
     ) -> None:
-        self._parent = parent
+        self._supervisor_connection = supervisor_connection
         self._channels = channels
         self._server_program = server_program
         self._drawing_stream = DrawingStream(server_program)
@@ -114,11 +117,11 @@ class _Publisher:
 
     def serve(self) -> None:
         """Show sessions until the supervisor ends, or closes this process's standard input."""
-        while self._parent.alive():
+        while self._supervisor_connection.alive():
             _arm_watchdog()
             self._show_new_records()
             try:
-                supervisor_message = self._parent.poll(self._pause_s)
+                supervisor_message = self._supervisor_connection.poll(self._pause_s)
             except EOFError:
                 break
             match supervisor_message:
@@ -132,18 +135,18 @@ class _Publisher:
                         self._shown_session.show_fit(fit)
                 case LiveSessionEnded():
                     self._finish_session(supervisor_message)
-        self._show_orphaned()
+        self._show_orphaned_session()
 
-    def linger(self, linger_s: float) -> None:
+    def keep_view_open(self, linger_s: float) -> None:
         """Keep the view open for `linger_s` seconds after the last session."""
         earliest_end_s = time.monotonic() + (
-            _LAST_MESSAGES_S if self._drawing_stream.connections else 0.0
+            _LAST_MESSAGES_WAIT_S if self._drawing_stream.connections else 0.0
         )
         end_s = max(earliest_end_s, time.monotonic() + linger_s)
-        while time.monotonic() < (end_s if self._parent.alive() else earliest_end_s):
+        while time.monotonic() < (end_s if self._supervisor_connection.alive() else earliest_end_s):
             _arm_watchdog()
             self._show_new_records()
-            time.sleep(_SEND_PERIOD_S)
+            time.sleep(_DRAWING_INTERVAL_S)
 
     @property
     def _pause_s(self) -> float:
@@ -151,11 +154,15 @@ class _Publisher:
         shown_session = self._shown_session
         if shown_session is not None and not shown_session.has_ended:
             # In a session that runs faster than real time, records would accumulate.
-            return _SEND_PERIOD_S if shown_session.reader.read_duration_s < _CATCH_UP_S else 0.0
-        must_wait = self._drawing_stream.stalled or (
+            return (
+                _DRAWING_INTERVAL_S
+                if shown_session.reader.read_duration_s < _MIN_CATCH_UP_SAMPLES_S
+                else 0.0
+            )
+        must_send_soon = self._drawing_stream.stalled or (
             shown_session is not None and bool(shown_session.backlog)
         )
-        return _SEND_PERIOD_S if must_wait else _IDLE_PERIOD_S
+        return _DRAWING_INTERVAL_S if must_send_soon else _IDLE_POLL_INTERVAL_S
 
     def _begin_session(self, session: LiveSession) -> None:
         """Show a new session, after the end of the previous one."""
@@ -170,25 +177,25 @@ class _Publisher:
         self._server_program.count_session()
         self._drawing_stream.begin(session.recording_id, self._shown_session.reader.scene.frame)
         self._show_new_records()
-        self._parent.send(LiveSessionShown(session.recording_id))
+        self._supervisor_connection.send(LiveSessionShown(session.recording_id))
 
-    def _finish_session(self, end: LiveSessionEnded) -> None:
+    def _finish_session(self, end_message: LiveSessionEnded) -> None:
         """Show the end of the present session, unless it is shown already."""
         if self._shown_session is not None and not self._shown_session.has_ended:
-            self._shown_session.finish(end)
+            self._shown_session.finish(end_message)
             self._show_new_records()
 
-    def _show_orphaned(self) -> None:
+    def _show_orphaned_session(self) -> None:
         """Show the present session, whose supervisor has ended, until its torque is off."""
         shown_session, shared_state = self._shown_session, self._channels.shared_state
         if shown_session is None or shown_session.has_ended:
             return
         shown_session.supervisor_lost = True
-        end_s = time.monotonic() + _MAX_ORPHANED_S
+        end_s = time.monotonic() + _MAX_ORPHANED_SESSION_S
         while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < end_s:
             _arm_watchdog()
             self._show_new_records()
-            time.sleep(_SEND_PERIOD_S)
+            time.sleep(_DRAWING_INTERVAL_S)
         self._finish_session(
             LiveSessionEnded(
                 tuple(ring_buffer.written_count for ring_buffer in self._channels.rings)
@@ -204,7 +211,7 @@ class _Publisher:
         if self._drawing_stream.ready() and self._shown_session is not None:
             self._shown_session.send(
                 self._drawing_stream,
-                connected=self._drawing_stream.connections != previous_connections,
+                is_new_connection=self._drawing_stream.connections != previous_connections,
             )
         self._announce_address()
 
@@ -213,7 +220,7 @@ class _Publisher:
         live_address = self._server_program.address
         if live_address is not None and live_address.server != self._announced_server:
             self._announced_server = live_address.server
-            self._parent.send(live_address)
+            self._supervisor_connection.send(live_address)
 
 
 class _ShownSession:
@@ -223,16 +230,16 @@ class _ShownSession:
         self, session: LiveSession, channels: Channels, earlier_response: LastResponse | None
     ) -> None:
         shared_state = self._shared_state = channels.shared_state
-        first_sample, seen_samples = (
+        first_sample, seen_sample_count = (
             session.begins[TOPICS.index(SAMPLE)],
             shared_state[StateField.LIVE_SAMPLES_SEEN],
         )
         # Continue the count of a previous publisher of the same session.
         self._dropped_before = (
-            shared_state[StateField.LIVE_SAMPLES_DROPPED] if seen_samples > first_sample else 0
+            shared_state[StateField.LIVE_SAMPLES_DROPPED] if seen_sample_count > first_sample else 0
         )
-        self.reader = SessionRecordReader(session, channels, seen_samples, earlier_response)
-        self.backlog = Backlog(round(_MAX_QUEUED_S * session.description.rate_hz))
+        self.reader = SessionRecordReader(session, channels, seen_sample_count, earlier_response)
+        self.backlog = Backlog(round(_MAX_QUEUED_SAMPLES_S * session.description.rate_hz))
         self.has_ended = False
         self.supervisor_lost = False
         self._health_reader = HealthReader(channels)
@@ -246,33 +253,35 @@ class _ShownSession:
         )
 
     @property
-    def dropped(self) -> int:
+    def dropped_samples(self) -> int:
         """Number of the session's samples that could not be shown."""
-        dropped_samples = self.reader.dropped + self.backlog.dropped + self._unsent_samples
-        return self._dropped_before + dropped_samples
+        dropped_by_this_publisher = (
+            self.reader.dropped_samples + self.backlog.dropped_samples + self._unsent_samples
+        )
+        return self._dropped_before + dropped_by_this_publisher
 
     def queue_new_records(self) -> None:
         """Queue the drawings of new records or, after the session, the text of its quick look."""
         if self.has_ended:
-            self._add_quick_look()
+            self._queue_quick_look()
             return
         new_drawings = self.reader.read_new_records()
-        queued_drawings = new_drawings.drawings
+        queued_drawings = new_drawings.other_drawings
         now_s = time.monotonic()
         if self._health_reader.is_due(now_s):
-            rig_health = self._health_reader.read(now_s, self.dropped)
+            rig_health = self._health_reader.read(now_s, self.dropped_samples)
             queued_drawings += self.reader.scene.health(self.reader.t_ns, rig_health)
         banner_state = SUPERVISOR_LOST if self.supervisor_lost else self._state_reader.read(now_s)
         queued_drawings += self.reader.scene.state(self.reader.t_ns, banner_state)
-        self.backlog.put_required(new_drawings.notes)
-        self.backlog.put(queued_drawings, new_drawings.samples)
-        self._store_counts()
+        self.backlog.put_required(new_drawings.note_drawings)
+        self.backlog.put(queued_drawings, new_drawings.new_sample_count)
+        self._store_sample_counts()
 
-    def _store_counts(self) -> None:
+    def _store_sample_counts(self) -> None:
         """Store the counts of shown and dropped samples for a publisher that replaces this one."""
         shared_state = self._shared_state
-        shared_state[StateField.LIVE_SAMPLES_DROPPED] = self.dropped
-        shown_samples = self.reader.next_index - self.backlog.samples
+        shared_state[StateField.LIVE_SAMPLES_DROPPED] = self.dropped_samples
+        shown_samples = self.reader.next_sample_number - self.backlog.queued_samples
         shared_state[StateField.LIVE_SAMPLES_SEEN] = max(
             shared_state[StateField.LIVE_SAMPLES_SEEN], shown_samples
         )
@@ -289,26 +298,26 @@ class _ShownSession:
         log_notes = [Note(t_ns, "info", fit_line) for fit_line in fit["text"]]
         self.backlog.put_required([*view_scene.fit(fit), *view_scene.events(log_notes)])
 
-    def finish(self, end: LiveSessionEnded) -> None:
+    def finish(self, end_message: LiveSessionEnded) -> None:
         """Queue the drawings of the session's remaining records and of its outcome."""
-        self.reader.end(end.ends)
+        self.reader.set_end(end_message.ends)
         self.queue_new_records()
         view_scene, t_ns = self.reader.scene, self.reader.t_ns
-        banner_state = ended(end.outcome, end.reason)
+        banner_state = ended(end_message.outcome, end_message.reason)
         if self.supervisor_lost:
             is_torque_off = self._shared_state[StateField.PHASE] == Phase.OFF
             banner_state = SUPERVISOR_LOST_TORQUE_OFF if is_torque_off else SUPERVISOR_LOST
             self.backlog.put_required(view_scene.events([Note(t_ns, "error", banner_state.reason)]))
-        elif end.outcome:
+        elif end_message.outcome:
             self.backlog.put_required(
-                view_scene.events([outcome_note(t_ns, end.outcome, end.reason)])
+                view_scene.events([outcome_note(t_ns, end_message.outcome, end_message.reason)])
             )
         # They follow all queued drawings, which show a running session.
         self.backlog.put([*view_scene.finish(), *view_scene.state(t_ns, banner_state)], 0)
         self.has_ended = True
-        self._add_quick_look()
+        self._queue_quick_look()
 
-    def _add_quick_look(self) -> None:
+    def _queue_quick_look(self) -> None:
         """Queue the log lines of the session's quick look as soon as its file exists."""
         if self._quick_look_path is None or not self._quick_look_path.exists():
             return
@@ -321,20 +330,20 @@ class _ShownSession:
             view_scene.events([Note(t_ns, "info", text_line) for text_line in quick_look["text"]])
         )
 
-    def send(self, drawing_stream: DrawingStream, *, connected: bool) -> None:
+    def send(self, drawing_stream: DrawingStream, *, is_new_connection: bool) -> None:
         """Send the queued drawings to the viewers.
 
-        `connected` states that the connection is new. Then the stream has already sent all drawings
-        that must not be dropped.
+        `is_new_connection` states that the connection is new. Then the stream has already sent all
+        drawings that must not be dropped.
         """
-        if connected:
+        if is_new_connection:
             self.backlog.drop_required()
         if self.backlog:
             drawings, sample_count = self.backlog.take()
             if not drawing_stream.send(drawings):
                 self._unsent_samples += sample_count
             if not self.has_ended:
-                self._store_counts()
+                self._store_sample_counts()
 
 
 def _arm_watchdog() -> None:
@@ -364,20 +373,20 @@ class Backlog:
 
     Attributes
     ----------
-    samples
+    queued_samples
         Number of samples that the queued drawings show.
-    dropped
+    dropped_samples
         Number of samples whose drawings were dropped.
     """
 
     def __init__(self, max_samples: int) -> None:
         self._max_samples = max_samples
         self._queue: collections.deque[tuple[list[Drawing], int]] = collections.deque()
-        self.samples = 0
+        self.queued_samples = 0
         self._required_drawings: collections.deque[Drawing] = collections.deque(
             maxlen=_MAX_REQUIRED_DRAWINGS
         )
-        self.dropped = 0
+        self.dropped_samples = 0
 
     def __bool__(self) -> bool:
         """Return whether any drawings still have to be sent to the viewers."""
@@ -395,11 +404,11 @@ class Backlog:
         """
         if drawings:
             self._queue.append((drawings, sample_count))
-            self.samples += sample_count
-        while self.samples > self._max_samples and len(self._queue) > 1:
+            self.queued_samples += sample_count
+        while self.queued_samples > self._max_samples and len(self._queue) > 1:
             _, lost_samples = self._queue.popleft()
-            self.samples -= lost_samples
-            self.dropped += lost_samples
+            self.queued_samples -= lost_samples
+            self.dropped_samples += lost_samples
 
     def put_required(self, drawings: "Iterable[Drawing]") -> None:
         """Queue drawings that are sent even if the queue is full, such as those of events."""
@@ -413,9 +422,9 @@ class Backlog:
         """Return all queued drawings and the number of samples they show, and clear the queue."""
         drawings = [
             *self._required_drawings,
-            *(draw_item for drawing_batch, _ in self._queue for draw_item in drawing_batch),
+            *(draw for drawing_batch, _ in self._queue for draw in drawing_batch),
         ]
-        sample_count, self.samples = self.samples, 0
+        sample_count, self.queued_samples = self.queued_samples, 0
         self._required_drawings.clear()
         self._queue.clear()
         return drawings, sample_count
@@ -449,15 +458,15 @@ def last_response(
         shown_response = None
     if session.folder is None:
         return shown_response
-    newest_pair = last_quick_look(
+    newest_path_and_quick_look = last_quick_look(
         session.folder,
         specimen,
         excluded_session=session.description.name,
         is_usable=itemgetter("response"),
     )
-    if newest_pair is None:
+    if newest_path_and_quick_look is None:
         return shown_response
-    document_path, quick_look = newest_pair
+    document_path, quick_look = newest_path_and_quick_look
     # Names of session files begin with the time of the session.
     if shown_response is not None and document_path.stem < shown_response.session:
         return shown_response
@@ -506,8 +515,10 @@ class SessionStateReader:
         """
         shared_state = self._shared_state
         session_phase = Phase(shared_state[StateField.PHASE])
-        silent_s = self._supervisor.stalled_for(shared_state[StateField.SUPERVISOR_BEAT], now_s)
-        if silent_s > _SUPERVISOR_TIMEOUT_S:
+        supervisor_silence_s = self._supervisor.stalled_for(
+            shared_state[StateField.SUPERVISOR_BEAT], now_s
+        )
+        if supervisor_silence_s > _SUPERVISOR_TIMEOUT_S:
             if session_phase in _TORQUE_PHASES:
                 return SUPERVISOR_SILENT
             if shared_state[StateField.RECORD_MAY_START] and session_phase is Phase.OFF:
@@ -520,9 +531,9 @@ class SessionStateReader:
         return _ACTIVITY_BANNERS[current_activity]
 
 
-POLL_S: Final = 0.25
+HEALTH_POLL_INTERVAL_S: Final = 0.25
 """Interval in seconds at which the rig's health is read."""
-_RATE_POLLS: Final = 4
+_RATE_MEASUREMENT_POLLS: Final = 4
 """Number of readings over which the loop's rate is measured."""
 
 
@@ -539,7 +550,7 @@ class HealthReader:
         self._shared_state = channels.shared_state
         self._samples = channels.samples
         self._ticks: collections.deque[tuple[float, int]] = collections.deque(
-            maxlen=_RATE_POLLS + 1
+            maxlen=_RATE_MEASUREMENT_POLLS + 1
         )
         self._next_reading_s = 0.0
 
@@ -558,7 +569,7 @@ class HealthReader:
             Number of the session's samples that could not be shown.
         """
         shared_state = self._shared_state
-        self._next_reading_s = now_s + POLL_S
+        self._next_reading_s = now_s + HEALTH_POLL_INTERVAL_S
         # Until tick 0 the shared state has the counts of the previous session.
         has_begun = bool(shared_state[StateField.RECORD_MAY_START])
         scheduled_ticks, missed_ticks, late_ticks, lost_samples = (
@@ -570,7 +581,7 @@ class HealthReader:
                 StateField.LOST_SAMPLES,
             )
         )
-        load_ppm = shared_state.known_value(StateField.BUS_LOAD_PPM)
+        bus_load_ppm = shared_state.known_value(StateField.BUS_LOAD_PPM)
         return Health(
             missed_ticks=missed_ticks,
             late_ticks=late_ticks,
@@ -578,19 +589,22 @@ class HealthReader:
             recorder_lag_ticks=self._samples.waiting_count,
             disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
             view_dropped=view_dropped,
-            bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
+            bus_load_percent=None if bus_load_ppm is None else bus_load_ppm * 1e-4,
             bus_errors=shared_state.known_value(StateField.BUS_ERRORS),
             sensor_status=shared_state.known_value(StateField.SENSOR_STATUS),
-            rate_hz=self._rate_hz(now_s, scheduled_ticks),
+            rate_hz=self._measured_loop_rate_hz(now_s, scheduled_ticks),
         )
 
-    def _rate_hz(self, now_s: float, scheduled_ticks: int) -> float | None:
+    def _measured_loop_rate_hz(self, now_s: float, scheduled_ticks: int) -> float | None:
         """Return the measured rate of the loop in Hz, or None between sessions."""
-        tick_counts = self._ticks
-        if tick_counts and scheduled_ticks < tick_counts[-1][1]:
-            tick_counts.clear()  # another session
-        tick_counts.append((now_s, scheduled_ticks))
-        (first_time_s, first_count), (last_time_s, last_count) = tick_counts[0], tick_counts[-1]
+        times_and_tick_counts = self._ticks
+        if times_and_tick_counts and scheduled_ticks < times_and_tick_counts[-1][1]:
+            times_and_tick_counts.clear()  # another session
+        times_and_tick_counts.append((now_s, scheduled_ticks))
+        (first_time_s, first_count), (last_time_s, last_count) = (
+            times_and_tick_counts[0],
+            times_and_tick_counts[-1],
+        )
         # While the count is constant, there is no session, or it is in preparation.
         return (
             (last_count - first_count) / (last_time_s - first_time_s)

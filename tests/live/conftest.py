@@ -411,7 +411,7 @@ def received(rerun_program, tmp_path_factory):
     One ended in a fault, the other with the loss of the supervisor. Also the number of ticks,
     the address of the view, and the responses of its page.
     """
-    long_timeout = "from rigd.live import publisher as p; p._MAX_QUEUED_S = 60.0"
+    long_timeout = "from rigd.live import publisher as p; p._MAX_QUEUED_SAMPLES_S = 60.0"
     with contextlib.ExitStack() as stack:
         producer = Producer(capacity=64_000)
         stack.callback(producer.close)
@@ -513,5 +513,5 @@ def publisher_without_drops(start_producer, start_publisher):
     """A publisher that drops nothing, even if the machine stalls for a minute."""
     return start_publisher(
         start_producer(capacity=64_000),
-        first="from rigd.live import publisher; publisher._MAX_QUEUED_S = 60.0",
+        first="from rigd.live import publisher; publisher._MAX_QUEUED_SAMPLES_S = 60.0",
     )

@@ -101,7 +101,7 @@ def test_error_message_if_the_server_does_not_start(runtime_folder, tmp_path, mo
     program = tmp_path / "rerun"
     program.write_text("#!/bin/sh\necho no such option >&2\nexit 2\n")
     program.chmod(0o755)
-    monkeypatch.setattr("rigd.live._program._program_path", lambda: str(program))
+    monkeypatch.setattr("rigd.live._program._rerun_program_path", lambda: str(program))
     server = RerunServer("antenna can")
     with pytest.raises(RerunError, match=r"ended: no such option\.$"):
         server.wait()

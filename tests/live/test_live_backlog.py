@@ -9,7 +9,7 @@ from rigd.engine.channels import TOPICS
 from rigd.engine.shared_state import StateField
 from rigd.live import publisher
 from rigd.live.messages import LiveSession
-from rigd.live.publisher import POLL_S, Backlog, HealthReader
+from rigd.live.publisher import HEALTH_POLL_INTERVAL_S, Backlog, HealthReader
 from rigd.view import SessionDescription
 
 pytestmark = pytest.mark.process
@@ -33,7 +33,7 @@ def test_drawings_are_sent_once_and_in_order():
     assert (names(drawings), samples) == (["note", "a", "b", "c"], 100)
     assert not backlog
     assert backlog.take() == ([], 0)
-    assert backlog.dropped == 0
+    assert backlog.dropped_samples == 0
 
 
 def test_oldest_samples_are_dropped_and_counted():
@@ -41,7 +41,7 @@ def test_oldest_samples_are_dropped_and_counted():
     backlog.put_required([drawing("note")])
     for number in range(5):
         backlog.put([drawing(number)], 40)
-    assert backlog.dropped == 120
+    assert backlog.dropped_samples == 120
     drawings, samples = backlog.take()
     assert (names(drawings), samples) == (["note", "3", "4"], 80)
 
@@ -50,7 +50,7 @@ def test_newest_samples_are_never_dropped():
     backlog = Backlog(max_samples=100)
     backlog.put([drawing("old")], 10)
     backlog.put([drawing("new")], 500)
-    assert (backlog.dropped, backlog.take()[1]) == (10, 500)
+    assert (backlog.dropped_samples, backlog.take()[1]) == (10, 500)
 
 
 def test_required_drawings_can_be_dropped():
@@ -121,13 +121,13 @@ def test_rate_is_that_of_the_last_second(channels):
     shared_state[StateField.RECORD_MAY_START] = 1
     rates = []
     for poll in range(20):
-        now_s = poll * POLL_S
+        now_s = poll * HEALTH_POLL_INTERVAL_S
         assert reader.is_due(now_s)
         shared_state[StateField.SCHEDULED_TICKS] = round(
             1000 * now_s if poll < 10 else 1250 + 500 * now_s
         )
         rates.append(reader.read(now_s, view_dropped=0).rate_hz)
-        assert not reader.is_due(now_s + 0.9 * POLL_S)
+        assert not reader.is_due(now_s + 0.9 * HEALTH_POLL_INTERVAL_S)
     assert rates[9] == pytest.approx(1000.0, abs=2.0)
     assert rates[-1] == pytest.approx(500.0, abs=2.0)
     shared_state[StateField.SCHEDULED_TICKS] = 10

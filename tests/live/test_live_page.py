@@ -93,7 +93,7 @@ def test_idle_connections_are_limited(monkeypatch):
 
 
 def test_duration_of_a_connection_is_limited(monkeypatch, page):
-    monkeypatch.setattr("rigd.live._page._MAX_CONNECTION_S", 0.2)
+    monkeypatch.setattr("rigd.live._page._MAX_CONNECTION_DURATION_S", 0.2)
     with socket.create_connection(("127.0.0.1", page.port), 30.0) as connection:
         connection.sendall(b"GET / HTTP/1.0\r\n")  # its end never comes
         assert connection.recv(1) == b""

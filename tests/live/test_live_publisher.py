@@ -27,7 +27,7 @@ from rigd.live.publisher import RerunError, main
 pytestmark = pytest.mark.process
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
-SHORT_QUEUE = "from rigd.live import publisher; publisher._MAX_QUEUED_S = 1.0"
+SHORT_QUEUE = "from rigd.live import publisher; publisher._MAX_QUEUED_SAMPLES_S = 1.0"
 
 
 def fetch(url: str):

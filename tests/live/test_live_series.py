@@ -69,7 +69,7 @@ def test_session_begun_with_a_frozen_server_is_shown_later(
 ):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
-        producer, first="from rigd.live import publisher; publisher._MAX_QUEUED_S = 1.0"
+        producer, first="from rigd.live import publisher; publisher._MAX_QUEUED_SAMPLES_S = 1.0"
     )
     server = publisher.server_pid
     os.kill(server, signal.SIGSTOP)

@@ -131,7 +131,7 @@ def test_lost_supervisor_is_reported(received):
 @pytest.mark.further
 def test_lost_supervisor_is_reported_with_the_torque_off(producer, start_publisher, save):
     publisher = start_publisher(
-        first="from rigd.live import publisher as p; p._MAX_ORPHANED_S = 0.5"
+        first="from rigd.live import publisher as p; p._MAX_ORPHANED_SESSION_S = 0.5"
     )
     shared_state = producer.channels.shared_state
     shared_state[StateField.PHASE] = Phase.RUNNING
