@@ -197,18 +197,18 @@ def fit_many(
     # The torque sensor is under the clamp: the inertia of the tool is added to the model, and never
     # subtracted from the data.
     undamped_plant = Plant(beam, Damping(), tool_inertia_kg_m2=tool_inertia_kg_m2)
-    full_grid = ResponseGrid(s)
+    full_response_grid = ResponseGrid(s)
     thinned_and_full_grids: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
     for weighting in weightings:
         full_grid_weights = weights(omega_rad_s, weighting)
         point_index, point_weights = representative_points(
             response, full_grid_weights, _THINNED_POINT_COUNT
         )
-        thinned_grid = ResponseGrid(s[point_index])
+        thinned_response_grid = ResponseGrid(s[point_index])
         thinned_and_full_grids.append(
             (
                 _FrequencyGrid(thinned_grid, undamped_plant, response[point_index], point_weights),
-                _FrequencyGrid(full_grid, undamped_plant, response, full_grid_weights),
+                _FrequencyGrid(full_response_grid, undamped_plant, response, full_grid_weights),
             )
         )
     return tuple(

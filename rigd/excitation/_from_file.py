@@ -92,7 +92,7 @@ def _read_columns(
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
     except TableError as error:
         # Without its text: the daemon may read files that the requesting user may not.
-        raise ExcitationError(f"{path}: {error.unquoted()}") from error
+        raise ExcitationError(f"{path}: {error.unquoted_message()}") from error
     angle_column = next(
         column_values
         for column_name, column_values in text_table.columns.items()
@@ -117,7 +117,8 @@ def _read_columns(
         if column_values is not None and not np.isfinite(column_values.values).all():
             row = int(np.argmin(np.isfinite(column_values.values)))
             raise ExcitationError(
-                f"{path}: line {text_table.lines[row]}: {column_name} is not a finite number."
+                f"{path}: line {text_table.line_numbers[row]}: {column_name} is not a finite "
+                "number."
             )
     if (
         time_column is not None
@@ -125,8 +126,8 @@ def _read_columns(
     ):
         row = int(np.argmax(is_not_increasing)) + 1
         raise ExcitationError(
-            f"{path}: line {text_table.lines[row]}: {TIME_COLUMN} does not come after the one "
-            "before it; times must increase."
+            f"{path}: line {text_table.line_numbers[row]}: {TIME_COLUMN} does not come after the "
+            "one before it; times must increase."
         )
     return (None if time_column is None else time_column.values), angle_column.values
 
@@ -142,14 +143,15 @@ def _read_table(table_stream: BinaryIO) -> TextTable:
     except MissingColumnError:
         pass
     else:
-        if text_table.width > 1:
+        if text_table.column_count > 1:
             raise TableError(
-                f"has {text_table.width} columns, {ANGLE_COLUMN} among them, but no {TIME_COLUMN}; "
+                f"has {text_table.column_count} columns, {ANGLE_COLUMN} among them, but no "
+                f"{TIME_COLUMN}; "
                 f"name the column of times in seconds so, or leave {ANGLE_COLUMN} alone."
             )
         return text_table
     text_table = read_table(table_stream, ("#1",), max_rows=MAX_SAMPLES)
-    if text_table.width > 1 or text_table.columns["#1"].title:
+    if text_table.column_count > 1 or text_table.columns["#1"].title:
         raise TableError(
             f"must name the columns {TIME_COLUMN} (s) and {ANGLE_COLUMN} (rad) in one line above "
             "the numbers, or be one column of angles in rad."

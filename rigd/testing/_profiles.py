@@ -7,15 +7,15 @@ from pathlib import Path
 
 from rigd.profile import load_profile
 
-Value = bool | float | str | Sequence[float | str]
+ProfileValue = bool | float | str | Sequence[float | str]
 """Value of a key in a profile."""
 
-_LINE_PATTERN = re.compile(r'(\w+)( *= *)(\{ value = )?(.*?)(, source = "\w+" \})?')
+_PROFILE_LINE_PATTERN = re.compile(r'(\w+)( *= *)(\{ value = )?(.*?)(, source = "\w+" \})?')
 """Pattern of a profile's line: key, value and source."""
 
 
 def write_profile(
-    folder: Path, new_values: Mapping[str, Value] | None = None, *, base_profile: str = "sim"
+    folder: Path, new_values: Mapping[str, ProfileValue] | None = None, *, base_profile: str = "sim"
 ) -> Path:
     """Write a profile that differs from another one in some values, and return its path.
 
@@ -54,20 +54,28 @@ def write_profile(
     remaining_values = dict(new_values or {})
     profile_name = str(remaining_values.get("name", load_profile(base_profile).name))
     profile_lines: list[str] = []
-    section = ""
+    section_prefix = ""
     for profile_line in load_profile(base_profile).text.splitlines():
         if profile_line.startswith("["):
-            profile_lines += _added_lines(section, remaining_values)
-            section = profile_line.strip("[] ") + "."
-        match = _LINE_PATTERN.fullmatch(profile_line)
-        if match and (key := section + match[1]) in remaining_values:
+            profile_lines += _added_lines(section_prefix, remaining_values)
+            section_prefix = profile_line.strip("[] ") + "."
+        line_match = _PROFILE_LINE_PATTERN.fullmatch(profile_line)
+        if line_match and (key := section_prefix + line_match[1]) in remaining_values:
             value_text = json.dumps(remaining_values.pop(key), ensure_ascii=False)
             profile_lines.append(
-                "".join((match[1], match[2], match[3] or "", value_text, match[5] or ""))
+                "".join(
+                    (
+                        line_match[1],
+                        line_match[2],
+                        line_match[3] or "",
+                        value_text,
+                        line_match[5] or "",
+                    )
+                )
             )
         else:
             profile_lines.append(profile_line)
-    profile_lines += _added_lines(section, remaining_values)
+    profile_lines += _added_lines(section_prefix, remaining_values)
     if remaining_values:
         raise ValueError(f"{base_profile} has no section for {', '.join(remaining_values)}")
     profile_path = folder / f"{profile_name}.toml"
@@ -75,7 +83,7 @@ def write_profile(
     return profile_path
 
 
-def _added_lines(section_name: str, remaining_values: dict[str, Value]) -> list[str]:
+def _added_lines(section_name: str, remaining_values: dict[str, ProfileValue]) -> list[str]:
     """Return lines for a section's keys that the base lacks.
 
     The keys are removed from `remaining_values`.
@@ -91,7 +99,7 @@ def _added_lines(section_name: str, remaining_values: dict[str, Value]) -> list[
     ]
 
 
-def _value_text(profile_value: Value) -> str:
+def _value_text(profile_value: ProfileValue) -> str:
     """Return a value as it is written in a profile."""
     value_json = json.dumps(profile_value, ensure_ascii=False)
     value_items = profile_value if isinstance(profile_value, Sequence) else (profile_value,)

@@ -170,15 +170,15 @@ def chirp_signals(
         chirp_phase_rad
     )
 
-    def motor(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def motor_response(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         return 1 / (1 + s / _MOTOR_LOOP_POLE_RAD_S) ** 2
 
-    def torque_of(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def torque_response(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         beam_response = transfer(s, beam, damping) + tool_inertia_kg_m2 * s**2
-        return np.asarray(beam_response * motor(s) * np.exp(-s * torque_delay_s))
+        return np.asarray(beam_response * motor_response(s) * np.exp(-s * torque_delay_s))
 
     measured_angle_rad = _causal_response(
-        chirp_reference_rad, rate_hz, lambda s: motor(s) * np.exp(-s * angle_delay_s)
+        chirp_reference_rad, rate_hz, lambda s: motor_response(s) * np.exp(-s * angle_delay_s)
     )
     if quantum_rad:
         measured_angle_rad = quantum_rad * np.round(measured_angle_rad / quantum_rad)
@@ -190,7 +190,9 @@ def chirp_signals(
         "sweep": (rest_samples, rest_samples + sweep_samples),
         "ring_down": (rest_samples + sweep_samples, chirp_reference_rad.size),
     }
-    coupling_torque_nm = _causal_response(chirp_reference_rad, rate_hz, torque_of) + torque_noise_nm
+    coupling_torque_nm = (
+        _causal_response(chirp_reference_rad, rate_hz, torque_response) + torque_noise_nm
+    )
     metadata = {"excitation": "chirp", "start_hz": repr(start_hz), "stop_hz": repr(stop_hz)}
     return Signals(
         chirp_reference_rad, measured_angle_rad, coupling_torque_nm, segments, rate_hz, metadata
@@ -279,20 +281,20 @@ def write_session(
 def _causal_response(
     input_values: NDArray[np.float64],
     rate_hz: float,
-    transfer_of_s: Callable[[NDArray[np.complex128]], NDArray[np.complex128]],
+    transfer_function: Callable[[NDArray[np.complex128]], NDArray[np.complex128]],
 ) -> NDArray[np.float64]:
     """Return the causal response (n,) of a transfer function to values that begin at rest.
 
     It does not use `rigd.beam.CausalTransform`, so that tests with these signals verify that class.
     """
-    n = len(input_values)
-    padded_length = 1 << (4 * n).bit_length()
-    sigma_per_s = rate_hz / n
-    decay_factors = np.exp(-sigma_per_s * np.arange(n) / rate_hz)
+    sample_count = len(input_values)
+    padded_length = 1 << (4 * sample_count).bit_length()
+    sigma_per_s = rate_hz / sample_count
+    decay_factors = np.exp(-sigma_per_s * np.arange(sample_count) / rate_hz)
     s = np.asarray(
         sigma_per_s + 2j * np.pi * np.fft.rfftfreq(padded_length, 1 / rate_hz), np.complex128
     )
     output_spectrum = np.multiply(
-        np.fft.rfft(input_values * decay_factors, padded_length), transfer_of_s(s)
+        np.fft.rfft(input_values * decay_factors, padded_length), transfer_function(s)
     )
-    return np.asarray(np.fft.irfft(output_spectrum, padded_length)[:n] / decay_factors)
+    return np.asarray(np.fft.irfft(output_spectrum, padded_length)[:sample_count] / decay_factors)

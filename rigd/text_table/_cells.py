@@ -11,20 +11,22 @@ POINT: Final = "."
 COMMA: Final = ","
 """Decimal comma."""
 
-_UNSIGNED_PATTERN: Final = r"(?:\d+{mark}?\d*|{mark}\d+)(?:[eE][-+]?\d+)?"
+_UNSIGNED_NUMBER_PATTERN: Final = r"(?:\d+{mark}?\d*|{mark}\d+)(?:[eE][-+]?\d+)?"
 """Pattern of a finite number without sign, in which {mark} is replaced by the decimal sign."""
 _NOT_FINITE_PATTERN: Final = r"nan|inf|infinity"
 """Pattern of NaN and infinity."""
 _NUMBER_PATTERNS: Final = {
-    mark: re.compile(
-        rf"[-+]?(?:{_UNSIGNED_PATTERN.replace('{mark}', re.escape(mark))}|{_NOT_FINITE_PATTERN})",
+    decimal_sign: re.compile(
+        rf"[-+]?(?:{_UNSIGNED_NUMBER_PATTERN.replace('{mark}', re.escape(decimal_sign))}"
+        rf"|{_NOT_FINITE_PATTERN})",
         re.ASCII | re.IGNORECASE,
     )
-    for mark in (POINT, COMMA)
+    for decimal_sign in (POINT, COMMA)
 }
 """Patterns of numbers, by decimal sign."""
-_GROUPED_PATTERNS: Final = {
-    mark: re.compile(rf"[-+]?[1-9]\d{{0,2}}{re.escape(mark)}\d{{3}}") for mark in (POINT, COMMA)
+_THREE_DECIMALS_PATTERNS: Final = {
+    decimal_sign: re.compile(rf"[-+]?[1-9]\d{{0,2}}{re.escape(decimal_sign)}\d{{3}}")
+    for decimal_sign in (POINT, COMMA)
 }
 """Patterns of numbers with exactly three digits after the decimal sign, by decimal sign."""
 _SHORT_INTEGER_PATTERN: Final = re.compile(r"[-+]?\d{1,3}")
@@ -33,7 +35,7 @@ _DATE_PATTERN: Final = re.compile(
     r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([ T_].*)?|(.*\d)?\d:\d\d(:\d.*)?"
 )
 """Pattern of a date or a time of day."""
-_DECIMALS_PATTERN: Final = re.compile(r"\d+(?:[eE][-+]?\d+)?")
+_DECIMAL_DIGITS_PATTERN: Final = re.compile(r"\d+(?:[eE][-+]?\d+)?")
 """Pattern of the digits after a decimal sign."""
 _LEADING_ZERO_PATTERN: Final = re.compile(r"0\d+.*")
 """Pattern of digits that begin with a zero."""
@@ -53,7 +55,7 @@ def is_any_number(cell: str) -> bool:
     return is_number(cell, POINT) or is_number(cell, COMMA)
 
 
-def number_of(cell: str, decimal_sign: str) -> float:
+def parse_number(cell: str, decimal_sign: str) -> float:
     """Return the number in a cell; NaN for an empty cell.
 
     Raise `ValueError` if the cell is not a number with that decimal sign.
@@ -69,7 +71,8 @@ def number_of(cell: str, decimal_sign: str) -> float:
 def fast_number_converter(decimal_sign: str) -> Callable[[str], float]:
     """Return a fast function that converts a cell to its number, for cells without underscores.
 
-    Unlike `number_of`, the function raises ValueError for an empty cell, and reads 1_000 as 1000.
+    Unlike `parse_number`, the function raises ValueError for an empty cell, and reads 1_000 as
+    1000.
     """
     return float if decimal_sign == POINT else _number_with_comma
 
@@ -106,7 +109,7 @@ class ThousandsCheck:
                 self.has_short_integer or _SHORT_INTEGER_PATTERN.fullmatch(cell_text) is not None
             )
             return False
-        if not _GROUPED_PATTERNS[self._decimal_sign].fullmatch(cell_text):
+        if not _THREE_DECIMALS_PATTERNS[self._decimal_sign].fullmatch(cell_text):
             return True
         self.first_grouped_line = self.first_grouped_line or line_number
         return False
@@ -121,7 +124,11 @@ def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
     has_leading_zero = False
     for row in rows:
         decimal_cells = [cell.strip() for cell in row[1::2]]
-        if not row or len(row) % 2 or not all(map(_DECIMALS_PATTERN.fullmatch, decimal_cells)):
+        if (
+            not row
+            or len(row) % 2
+            or not all(map(_DECIMAL_DIGITS_PATTERN.fullmatch, decimal_cells))
+        ):
             return False
         if not all(_INTEGER_PATTERN.fullmatch(cell.strip()) for cell in row[::2]):
             return False
@@ -139,7 +146,7 @@ def without_comment_mark(cell: str) -> str:
     return _COMMENT_PATTERN.sub("", cell, count=1) if _COMMENT_PATTERN.match(cell) else cell
 
 
-def is_comment(row: Sequence[str]) -> bool:
+def is_comment_row(row: Sequence[str]) -> bool:
     """Return whether a line is a comment or a horizontal rule, such as dashes below the titles."""
     line_text = "".join(row).strip()
     return _COMMENT_PATTERN.match(line_text) is not None or set(line_text) <= set("-=_+|*: ")

@@ -15,7 +15,7 @@ _MAX_MARK_BYTES: Final = 4
 """Number of bytes in the longest byte order mark."""
 
 
-def encodings(first_bytes: bytes) -> tuple[str, ...]:
+def possible_encodings(first_bytes: bytes) -> tuple[str, ...]:
     """Return the possible encodings of a file from its first bytes, the most probable first.
 
     Most programs that do not write UTF-8 write Windows-1252. Numbers have the same bytes in both

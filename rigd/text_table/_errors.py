@@ -32,7 +32,7 @@ class TableError(Exception):
         cell_text = f" ('{printable(self.cell, _MAX_CELL_CHARACTERS_SHOWN)}')" if self.cell else ""
         return self.message.replace("{cell}", cell_text)
 
-    def unquoted(self) -> str:
+    def unquoted_message(self) -> str:
         """Return the message without any text from the file."""
         return self.message.replace("{cell}", "")
 
@@ -42,31 +42,32 @@ class MissingColumnError(TableError):
 
     Parameters
     ----------
-    name : str
+    requested_title : str
         Requested title that is missing.
     titles : sequence of str
         Titles in the most probable line of titles.
-    line : int
+    line_number : int
         Number of this line; 0 if there is none.
     """
 
-    def __init__(self, name: str, titles: Sequence[str], line: int) -> None:
-        listed_titles = ", ".join(
+    def __init__(self, requested_title: str, titles: Sequence[str], line_number: int) -> None:
+        listed_titles_text = ", ".join(
             repr(printable(title, 60)) for title in titles[:_MAX_TITLES_SHOWN]
         )
-        more_titles = (
+        more_titles_text = (
             f" and {len(titles) - _MAX_TITLES_SHOWN} more"
             if len(titles) > _MAX_TITLES_SHOWN
             else ""
         )
-        line_text = f" (line {line})" if line else ""
+        line_text = f" (line {line_number})" if line_number else ""
         super().__init__(
-            f"has no channel '{name}'; it has {listed_titles}{more_titles}{line_text}."
+            f"has no channel '{requested_title}'; it has "
+            f"{listed_titles_text}{more_titles_text}{line_text}."
             if titles
-            else f"has no channel '{name}', and no other either."
+            else f"has no channel '{requested_title}', and no other either."
         )
-        self.name = name
+        self.requested_title = requested_title
 
-    def unquoted(self) -> str:
+    def unquoted_message(self) -> str:
         """Return the message without the titles of the file."""
-        return f"has no column '{self.name}'."
+        return f"has no column '{self.requested_title}'."

@@ -10,7 +10,7 @@ from rigd.text_table import _labview
 from rigd.text_table._cells import (
     are_split_decimals,
     is_any_number,
-    is_comment,
+    is_comment_row,
     is_date,
     is_row_of_units,
     without_comment_mark,
@@ -39,7 +39,7 @@ _EXCEL_SEPARATOR_LINE: Final = "sep="
 """Beginning of the line with which Excel states the separator."""
 _MAX_LINES_BELOW_TITLES: Final = 6
 """Largest number of lines between the titles and the first line of numbers."""
-_NUMBERING_LINES: Final = 5
+_NUMBERING_CHECK_ROWS: Final = 5
 """Number of rows below a row 1, 2, 3, … that are read to decide whether it numbers the columns."""
 
 
@@ -49,17 +49,17 @@ class TextRow:
 
     Attributes
     ----------
-    line : int
+    line_number : int
         Number of the row's first line, from 1.
     cells : list of str
         Texts of the cells without surrounding blanks.
-    index : int
+    row_index : int
         Number of rows before this one, including empty rows.
     """
 
-    line: int
+    line_number: int
     cells: list[str]
-    index: int
+    row_index: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,21 +72,21 @@ class TableLayout:
         Character between cells. A blank means any number of blanks.
     titles : tuple of str
         Title of each column; empty if the table has no titles.
-    titles_line : int
+    titles_line_number : int
         Number of the line with the titles; 0 if the table has no titles.
     units : tuple of str
         Units in the row below the titles; "" for an empty cell. Empty if there is no such row.
-    width : int
+    column_count : int
         Number of cells in each row.
-    optional_columns : int
+    optional_column_count : int
         Number of columns at the end that a row may lack, such as the comment in LabVIEW's files.
-    rows_before_numbers : int
+    row_count_before_numbers : int
         Number of rows before the first row of numbers.
-    columns : tuple of int
+    requested_column_indices : tuple of int
         Indices of the requested columns, in the order of the request.
-    first_cells : tuple of str
+    first_row_cells : tuple of str
         Cells of the first row of numbers.
-    labview : LabviewHead or None
+    labview_head : LabviewHead or None
         Head of the file if it is a LabVIEW measurement file.
     rate_hz : float or None
         Sampling rate stated in the head of another file; None if there is none.
@@ -94,25 +94,25 @@ class TableLayout:
 
     separator: str
     titles: tuple[str, ...]
-    titles_line: int
+    titles_line_number: int
     units: tuple[str, ...]
-    width: int
-    optional_columns: int
-    rows_before_numbers: int
-    columns: tuple[int, ...]
-    first_cells: tuple[str, ...]
-    labview: "_labview.LabviewHead | None" = None
+    column_count: int
+    optional_column_count: int
+    row_count_before_numbers: int
+    requested_column_indices: tuple[int, ...]
+    first_row_cells: tuple[str, ...]
+    labview_head: "_labview.LabviewHead | None" = None
     rate_hz: float | None = None
 
 
 def stated_separator(first_line: str) -> str | None:
     """Return the separator that Excel's line ``sep=;`` states; None for any other line."""
     line_text = first_line.rstrip("\r\n").strip('"')
-    is_statement = (
+    is_separator_statement = (
         line_text[: len(_EXCEL_SEPARATOR_LINE)].lower() == _EXCEL_SEPARATOR_LINE
         and len(line_text) == len(_EXCEL_SEPARATOR_LINE) + 1
     )
-    return line_text[-1] if is_statement else None
+    return line_text[-1] if is_separator_statement else None
 
 
 def rows_of_cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -122,10 +122,10 @@ def rows_of_cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, l
             yield line_number, row_cells.split()
         return
     csv_reader = csv.reader(lines, delimiter=separator)
-    lines_before = 0
+    lines_before_row = 0
     for row in csv_reader:
-        yield lines_before + 1, row
-        lines_before = csv_reader.line_num
+        yield lines_before_row + 1, row
+        lines_before_row = csv_reader.line_num
 
 
 def without_trailing_empty_cells(row: Sequence[str], column_count: int) -> list[str]:
@@ -137,16 +137,20 @@ def without_trailing_empty_cells(row: Sequence[str], column_count: int) -> list[
 
 
 def wrong_width_message(
-    line_number: int, cell_count: int, layout_width: int, titles_line: int, separator: str
+    line_number: int,
+    cell_count: int,
+    expected_cell_count: int,
+    titles_line_number: int,
+    separator: str,
 ) -> str:
     """Return the error message for a row with too many or too few cells."""
-    expected_width = (
-        f"line {titles_line} has {_count_with_noun(layout_width, 'title')}"
-        if titles_line
-        else f"the lines above have {layout_width}"
+    expected_width_text = (
+        f"line {titles_line_number} has {_count_with_noun(expected_cell_count, 'title')}"
+        if titles_line_number
+        else f"the lines above have {expected_cell_count}"
     )
     separator_name = _SEPARATOR_NAMES.get(separator, repr(separator))
-    if cell_count > layout_width:
+    if cell_count > expected_cell_count:
         cause_text = (
             "decimal commas in a file that separates by commas, an index without a title and a "
             "separator inside a text add cells"
@@ -163,7 +167,7 @@ def wrong_width_message(
         remedy_text = "repair or remove the line; an unknown value is an empty cell"
     return (
         f"line {line_number} has {_count_with_noun(cell_count, 'cell')} between {separator_name}, "
-        f"and {expected_width}: {cause_text}; {remedy_text}."
+        f"and {expected_width_text}: {cause_text}; {remedy_text}."
     )
 
 
@@ -184,7 +188,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
     separator_in_file = stated_separator(lines[0])
     if separator_in_file:
         lines = ["\n", *lines[1:]]
-    labview_head = _labview.head_of(lines)
+    labview_head = _labview.parse_labview_head(lines)
     if labview_head is not None:
         separator_in_file = labview_head.separator
     present_separators = [
@@ -210,7 +214,9 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
             continue
         nonempty_rows = [row for row in text_rows if any(row.cells)]
         if labview_head is not None:
-            nonempty_rows = [row for row in nonempty_rows if row.line > labview_head.last_line]
+            nonempty_rows = [
+                row for row in nonempty_rows if row.line_number > labview_head.last_line
+            ]
         try:
             possible_layout = _layout_with_separator(
                 nonempty_rows, separator, requested_names, labview_head
@@ -220,10 +226,12 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
             failed_attempts.append(failure)
             continue
         if separator == ",":
-            _check_split_decimals(text_rows[possible_layout.rows_before_numbers :], possible_layout)
+            _check_split_decimals(
+                text_rows[possible_layout.row_count_before_numbers :], possible_layout
+            )
         if (
             best_layout is None
-            or possible_layout.rows_before_numbers < best_layout.rows_before_numbers
+            or possible_layout.row_count_before_numbers < best_layout.row_count_before_numbers
         ):
             best_layout = possible_layout
     nearest_failure = max(failed_attempts, key=lambda failure: failure.rank, default=None)
@@ -231,7 +239,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
     has_earlier_titles = any(
         failure.rank == _RANK_ALL_TITLES
         and best_layout
-        and failure.row_index < best_layout.rows_before_numbers
+        and failure.row_index < best_layout.row_count_before_numbers
         and failure.separator != BLANK_SEPARATOR
         for failure in failed_attempts
     )
@@ -240,7 +248,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
         raise nearest_failure.error
     if labview_head is None:
         return replace(
-            best_layout, rate_hz=stated_rate_hz(lines[: best_layout.rows_before_numbers])
+            best_layout, rate_hz=stated_rate_hz(lines[: best_layout.row_count_before_numbers])
         )
     return best_layout
 
@@ -279,7 +287,7 @@ def _layout_with_separator(
     ]
     if not rows:
         raise _NotThisTableError(_RANK_NO_ROWS, TableError("has no lines below its header."))
-    best_failure: _NotThisTableError | None = None
+    first_failure: _NotThisTableError | None = None
     for row_index, row in enumerate(rows):
         if requested_titles and not _has_titles(row, requested_titles):
             continue
@@ -295,12 +303,12 @@ def _layout_with_separator(
                 return found_layout
         except _NotThisTableError as failure:
             if failure.row_index == MAX_HEAD_LINES:
-                failure.row_index = row.index
+                failure.row_index = row.row_index
             if not requested_titles:
                 raise
-            best_failure = best_failure or failure
-    if best_failure is not None:
-        raise best_failure
+            first_failure = first_failure or failure
+    if first_failure is not None:
+        raise first_failure
     if requested_titles:
         raise _missing_title_error(rows, requested_titles)
     raise _NotThisTableError(
@@ -345,13 +353,13 @@ def _has_titles(row: TextRow, requested_titles: Iterable[str]) -> bool:
 
 def _layout_below_titles(
     rows: Sequence[TextRow],
-    titles_index: int,
+    titles_row_index: int,
     separator: str,
     requested_names: Sequence[str],
     labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
     """Return the layout of the table below a row of titles, or raise an error for the user."""
-    titles_row = rows[titles_index]
+    titles_row = rows[titles_row_index]
     raw_titles, plain_titles = (
         without_trailing_empty_cells(titles_row.cells, 0),
         _plain_titles(titles_row),
@@ -367,7 +375,7 @@ def _layout_below_titles(
     )
     # "#" or "%" alone may mark a comment or be the title of an index.
     if len(plain_titles) < len(raw_titles):
-        next_row = _next_row(rows, titles_row)
+        next_row = _row_after(rows, titles_row)
         titles = (
             raw_titles
             if next_row is None or len(next_row.cells) == len(raw_titles)
@@ -381,7 +389,7 @@ def _layout_below_titles(
                 _RANK_ALL_TITLES,
                 TableError(
                     f"{titles.count(column_name)} columns are named '{column_name}' (line "
-                    f"{titles_row.line}); give the number, such as "
+                    f"{titles_row.line_number}); give the number, such as "
                     f"#{titles.index(column_name) + 1} for the first of "
                     "them."
                 ),
@@ -393,31 +401,33 @@ def _layout_below_titles(
             column_indices.append(column_number - 1)
         else:
             raise _NotThisTableError(
-                _RANK_ALL_TITLES, MissingColumnError(column_name, titles, titles_row.line)
+                _RANK_ALL_TITLES, MissingColumnError(column_name, titles, titles_row.line_number)
             )
-    optional_columns = int(labview_head is not None and titles[-1] == _labview.COMMENT_TITLE)
+    optional_column_count = int(
+        labview_head is not None and titles[-1] == _labview.COMMENT_COLUMN_TITLE
+    )
     units: Sequence[str] = ()
-    cells_above = rows[titles_index - 1].cells if titles_index else []
+    cells_above = rows[titles_row_index - 1].cells if titles_row_index else []
     if len(without_trailing_empty_cells(cells_above, column_count)) == column_count and all(
         is_unit(cell) for cell in cells_above if cell
     ):
         units = cells_above
-    for row in rows[titles_index + 1 : titles_index + 2 + _MAX_LINES_BELOW_TITLES]:
+    for row in rows[titles_row_index + 1 : titles_row_index + 2 + _MAX_LINES_BELOW_TITLES]:
         row_cells = without_trailing_empty_cells(row.cells, column_count)
-        has_table_width = column_count - optional_columns <= len(row_cells) <= column_count
-        if has_table_width and _is_data(row_cells, column_indices, _next_row(rows, row)):
-            _check_single_column(row.line, row_cells)
+        has_table_width = column_count - optional_column_count <= len(row_cells) <= column_count
+        if has_table_width and _is_row_of_numbers(row_cells, column_indices, _row_after(rows, row)):
+            _check_single_column(row.line_number, row_cells)
             return TableLayout(
                 separator=separator,
                 titles=tuple(titles),
-                titles_line=titles_row.line,
+                titles_line_number=titles_row.line_number,
                 units=tuple(bare_unit(cell) for cell in units),
-                width=column_count,
-                optional_columns=optional_columns,
-                rows_before_numbers=row.index,
-                columns=tuple(column_indices),
-                first_cells=tuple(row_cells),
-                labview=labview_head,
+                column_count=column_count,
+                optional_column_count=optional_column_count,
+                row_count_before_numbers=row.row_index,
+                requested_column_indices=tuple(column_indices),
+                first_row_cells=tuple(row_cells),
+                labview_head=labview_head,
             )
         if (
             len(row_cells) <= column_count
@@ -426,16 +436,16 @@ def _layout_below_titles(
         ):
             units = row_cells + [""] * (column_count - len(row_cells))
             continue
-        if is_comment(row_cells):
+        if is_comment_row(row_cells):
             continue
         row_error = _error_for_unexpected_row(
             row, row_cells, column_indices, requested_names, titles_row, column_count, separator
         )
-        raise _NotThisTableError(_RANK_ALL_TITLES, row_error, row.index)
+        raise _NotThisTableError(_RANK_ALL_TITLES, row_error, row.row_index)
     raise _NotThisTableError(
         _RANK_ALL_TITLES,
         TableError(
-            f"has 0 samples: no line of numbers below the titles in line {titles_row.line}."
+            f"has 0 samples: no line of numbers below the titles in line {titles_row.line_number}."
         ),
     )
 
@@ -454,12 +464,14 @@ def comma_in_single_message(line_number: int) -> str:
     )
 
 
-def _next_row(rows: Sequence[TextRow], earlier_row: TextRow) -> TextRow | None:
+def _row_after(rows: Sequence[TextRow], earlier_row: TextRow) -> TextRow | None:
     """Return the row after a given one; None if it is the last."""
-    return next((later_row for later_row in rows if later_row.index > earlier_row.index), None)
+    return next(
+        (later_row for later_row in rows if later_row.row_index > earlier_row.row_index), None
+    )
 
 
-def _is_data(
+def _is_row_of_numbers(
     row_cells: Sequence[str], column_indices: Sequence[int], next_row: TextRow | None
 ) -> bool:
     """Return whether a row is one of the table's rows of numbers.
@@ -493,7 +505,9 @@ def _error_for_unexpected_row(
     """Return the error for a row below the titles that is neither numbers nor units."""
     if len(row_cells) != column_count:
         return TableError(
-            wrong_width_message(row.line, len(row_cells), column_count, titles_row.line, separator)
+            wrong_width_message(
+                row.line_number, len(row_cells), column_count, titles_row.line_number, separator
+            )
         )
     for column_name, column_index in zip(requested_names, column_indices, strict=True):
         if (
@@ -501,10 +515,10 @@ def _error_for_unexpected_row(
             and not is_any_number(row_cells[column_index])
             and not is_stamp(row_cells[column_index])
         ):
-            return not_a_number_error(row.line, column_name, row_cells[column_index])
+            return not_a_number_error(row.line_number, column_name, row_cells[column_index])
     return TableError(
-        f"line {row.line} has texts where the line below has numbers, and is not a row of units; "
-        "remove it."
+        f"line {row.line_number} has texts where the line below has numbers, and is not a row of "
+        "units; remove it."
     )
 
 
@@ -538,28 +552,30 @@ def _layout_from_numbers(
     """
     row, rows_above = (
         rows[row_index],
-        list(takewhile(lambda other_row: other_row.index < rows[row_index].index, rows)),
+        list(takewhile(lambda other_row: other_row.row_index < rows[row_index].row_index, rows)),
     )
     column_indices = [number - 1 for number in column_numbers]
-    if is_comment(row.cells):
+    if is_comment_row(row.cells):
         return None
-    if not _is_data(row.cells, column_indices, _next_row(rows, row)) or _is_row_of_column_numbers(
-        rows, row_index
-    ):
-        filled_columns = [c for c in column_indices if c < len(row.cells) and row.cells[c]]
-        number_columns = [c for c in filled_columns if is_any_number(row.cells[c])]
-        row_below = _next_row(rows, row)
+    if not _is_row_of_numbers(
+        row.cells, column_indices, _row_after(rows, row)
+    ) or _is_row_of_column_numbers(rows, row_index):
+        filled_column_indices = [c for c in column_indices if c < len(row.cells) and row.cells[c]]
+        number_column_indices = [c for c in filled_column_indices if is_any_number(row.cells[c])]
+        row_below = _row_after(rows, row)
         if (
-            number_columns
-            and len(number_columns) < len(filled_columns)
+            number_column_indices
+            and len(number_column_indices) < len(filled_column_indices)
             and row_below is not None
             and len(row_below.cells) == len(row.cells)
             and not _is_row_of_column_numbers(rows, row_index)
         ):
-            column_index = next(c for c in filled_columns if c not in number_columns)
+            column_index = next(c for c in filled_column_indices if c not in number_column_indices)
             raise _NotThisTableError(
                 _RANK_ALL_TITLES,
-                not_a_number_error(row.line, f"#{column_index + 1}", row.cells[column_index]),
+                not_a_number_error(
+                    row.line_number, f"#{column_index + 1}", row.cells[column_index]
+                ),
             )
         return None
     units: Sequence[str] = ()
@@ -573,42 +589,44 @@ def _layout_from_numbers(
     ):
         units = rows_above.pop().cells
     titles: Sequence[str] = ()
-    titles_line = 0
-    optional_columns = 0
+    titles_line_number = 0
+    optional_column_count = 0
     if rows_above and (len(_plain_titles(rows_above[-1])) > 1 or len(row.cells) == 1):
-        titles, titles_line = _plain_titles(rows_above[-1]), rows_above[-1].line
-        optional_columns = int(labview_head is not None and titles[-1:] == [_labview.COMMENT_TITLE])
+        titles, titles_line_number = _plain_titles(rows_above[-1]), rows_above[-1].line_number
+        optional_column_count = int(
+            labview_head is not None and titles[-1:] == [_labview.COMMENT_COLUMN_TITLE]
+        )
     if titles and not units and all(is_unit(title) for title in titles if title):
         units = titles
     row_cells = without_trailing_empty_cells(row.cells, len(titles)) if titles else row.cells
-    if titles and not len(titles) - optional_columns <= len(row_cells) <= len(titles):
+    if titles and not len(titles) - optional_column_count <= len(row_cells) <= len(titles):
         if separator != BLANK_SEPARATOR or len(row_cells) > len(titles):
             raise _NotThisTableError(
                 _RANK_ALL_TITLES,
                 TableError(
                     wrong_width_message(
-                        row.line, len(row_cells), len(titles), titles_line, separator
+                        row.line_number, len(row_cells), len(titles), titles_line_number, separator
                     )
                 ),
             )
-        titles, titles_line = (), 0  # titles of several words cannot be separated
+        titles, titles_line_number = (), 0  # titles of several words cannot be separated
     column_count = len(titles) if titles else len(row_cells)
-    _check_single_column(row.line, row_cells)
+    _check_single_column(row.line_number, row_cells)
     return TableLayout(
         separator=separator,
         titles=tuple(titles),
-        titles_line=titles_line,
+        titles_line_number=titles_line_number,
         units=tuple(
             bare_unit(cell) for cell in [*units, *[""] * (column_count - len(units))][:column_count]
         )
         if units
         else (),
-        width=column_count,
-        optional_columns=optional_columns,
-        rows_before_numbers=row.index,
-        columns=tuple(column_indices),
-        first_cells=tuple(row_cells),
-        labview=labview_head,
+        column_count=column_count,
+        optional_column_count=optional_column_count,
+        row_count_before_numbers=row.row_index,
+        requested_column_indices=tuple(column_indices),
+        first_row_cells=tuple(row_cells),
+        labview_head=labview_head,
     )
 
 
@@ -624,7 +642,7 @@ def _is_row_of_column_numbers(text_rows: Sequence[TextRow], row_index: int) -> b
         filled_cells == [str(first_number + n) for n in range(len(filled_cells))]
         for first_number in (0, 1)
     )
-    rows_below = text_rows[1 : 1 + _NUMBERING_LINES]
+    rows_below = text_rows[1 : 1 + _NUMBERING_CHECK_ROWS]
     return (
         counts_upwards
         and bool(rows_below)
@@ -648,16 +666,17 @@ def _missing_title_error(
             for requested_name in requested_names
         )
 
-    best_row = max(rows, key=count_found_names)
-    if count_found_names(best_row):
-        titles = _plain_titles(best_row)
+    likely_titles_row = max(rows, key=count_found_names)
+    if count_found_names(likely_titles_row):
+        titles = _plain_titles(likely_titles_row)
         missing_name = next(
             title
             for title in requested_names
-            if title not in titles and title not in best_row.cells
+            if title not in titles and title not in likely_titles_row.cells
         )
         return _NotThisTableError(
-            _RANK_SOME_TITLES, MissingColumnError(missing_name, titles, best_row.line)
+            _RANK_SOME_TITLES,
+            MissingColumnError(missing_name, titles, likely_titles_row.line_number),
         )
     row_index = next(
         (
@@ -670,31 +689,36 @@ def _missing_title_error(
     if row_index is None:
         return _NotThisTableError(
             _RANK_NO_ROWS,
-            MissingColumnError(requested_names[0], _plain_titles(rows[0]), rows[0].line),
+            MissingColumnError(requested_names[0], _plain_titles(rows[0]), rows[0].line_number),
         )
     column_count = len(rows[row_index].cells)
     rows_above = [row for row in rows[:row_index] if len(_plain_titles(row)) == column_count]
     if rows_above:
-        best_row = (
+        likely_titles_row = (
             rows_above[-2]
             if len(rows_above) > 1 and is_row_of_units(rows_above[-1].cells, range(column_count))
             else rows_above[-1]
         )
-        titles, line = _plain_titles(best_row), best_row.line
+        titles, titles_line_number = _plain_titles(likely_titles_row), likely_titles_row.line_number
     else:
-        titles, line = [f"#{column_number}" for column_number in range(1, column_count + 1)], 0
+        titles, titles_line_number = (
+            [f"#{column_number}" for column_number in range(1, column_count + 1)],
+            0,
+        )
     return _NotThisTableError(
         _RANK_NO_TITLES if column_count > 1 else _RANK_NO_ROWS,
-        MissingColumnError(requested_names[0], titles, line),
+        MissingColumnError(requested_names[0], titles, titles_line_number),
     )
 
 
 def _no_numbers_error(rows: Sequence[TextRow], requested_names: Sequence[str]) -> TableError:
     """Return the error for a table that has no row with numbers in the requested columns."""
-    max_cells = max(len(row.cells) for row in rows)
+    max_cell_count = max(len(row.cells) for row in rows)
     for column_name in requested_names:
-        if (_column_number(column_name) or 0) > max_cells:
-            return MissingColumnError(column_name, [f"#{n}" for n in range(1, max_cells + 1)], 0)
+        if (_column_number(column_name) or 0) > max_cell_count:
+            return MissingColumnError(
+                column_name, [f"#{n}" for n in range(1, max_cell_count + 1)], 0
+            )
     return TableError(
         f"has 0 samples: none of its first {len(rows)} lines has numbers in all of the columns "
         f"{', '.join(requested_names)}."
@@ -704,11 +728,14 @@ def _no_numbers_error(rows: Sequence[TextRow], requested_names: Sequence[str]) -
 def _check_split_decimals(rows: Sequence[TextRow], layout: TableLayout) -> None:
     """Raise TableError if commas in decimal numbers were taken as separators of cells."""
     nonempty_rows = [
-        without_trailing_empty_cells(row.cells, layout.width) for row in rows if any(row.cells)
+        without_trailing_empty_cells(row.cells, layout.column_count)
+        for row in rows
+        if any(row.cells)
     ]
     if are_split_decimals(nonempty_rows):
         raise TableError(
-            f"line {rows[0].line}: every second cell between commas looks like the decimals of the "
+            f"line {rows[0].line_number}: every second cell between commas looks like the "
+            "decimals of the "
             "one before it; save the file with decimal points, or with semicolons or tabs between "
             "the columns."
         )

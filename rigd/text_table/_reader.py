@@ -20,9 +20,9 @@ from rigd.text_table._cells import (
     fast_number_converter,
     is_any_number,
     is_number,
-    number_of,
+    parse_number,
 )
-from rigd.text_table._encoding import encodings
+from rigd.text_table._encoding import possible_encodings
 from rigd.text_table._errors import TableError
 from rigd.text_table._layout import (
     MAX_HEAD_LINES,
@@ -43,7 +43,7 @@ MAX_LINE_CHARACTERS: Final = 65_536
 
 It is enough for hundreds of columns."""
 
-_ENCODING_BYTES: Final = 4
+_ENCODING_DETECTION_BYTES: Final = 4
 """Number of bytes from which the encoding is detected."""
 _MAX_HEAD_CHARACTERS: Final = 1_000_000
 """Number of characters after which no further lines are read to detect the layout."""
@@ -103,9 +103,9 @@ class TextTable:
     ----------
     columns : mapping of str to TableColumn
         Columns by requested name, all with the same number of rows.
-    lines : ndarray of uint32, shape (n,)
+    line_numbers : ndarray of uint32, shape (n,)
         Number of each row's line in the file, from 1.
-    width : int
+    column_count : int
         Number of columns in the table.
     times : TableTimes or None
         Column of times in addition to the requested columns; None if there is none.
@@ -114,8 +114,8 @@ class TextTable:
     """
 
     columns: Mapping[str, TableColumn]
-    lines: npt.NDArray[np.uint32]
-    width: int
+    line_numbers: npt.NDArray[np.uint32]
+    column_count: int
     times: TableTimes | None = None
     remark: str = ""
 
@@ -155,11 +155,11 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, max_rows: in
     ([0.5, 0.7], 'rad')
     """
     stream.seek(0)
-    first_bytes = stream.read(_ENCODING_BYTES)
+    first_bytes = stream.read(_ENCODING_DETECTION_BYTES)
     last_decoding_error: UnicodeError | None = None
-    for possible_encoding in encodings(first_bytes):
+    for possible_encoding in possible_encodings(first_bytes):
         try:
-            return _read(stream, possible_encoding, requested_names, max_rows)
+            return _read_encoded_table(stream, possible_encoding, requested_names, max_rows)
         except UnicodeError as found:
             last_decoding_error = last_decoding_error or found
         except csv.Error as found:
@@ -169,13 +169,16 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, max_rows: in
     ) from last_decoding_error
 
 
-def _read(
+def _read_encoded_table(
     stream: BinaryIO, encoding: str, requested_names: Sequence[str], max_rows: int
 ) -> TextTable:
     """Read columns of a text with a given encoding."""
     with _open_lines(stream, encoding) as text_lines:
         table_layout = find_layout(_first_lines(text_lines), requested_names)
-    first_cells = [table_layout.first_cells[column_index] for column_index in table_layout.columns]
+    first_cells = [
+        table_layout.first_row_cells[column_index]
+        for column_index in table_layout.requested_column_indices
+    ]
     decimal_sign = (
         COMMA if any(COMMA in cell and not is_stamp(cell) for cell in first_cells) else POINT
     )
@@ -230,53 +233,57 @@ def _lines_of_bounded_length(text_stream: TextIOWrapper) -> Iterator[str]:
 
 
 @dataclass(slots=True)
-class _NumberRows:
+class _NumberRowReader:
     """Reader of rows of numbers that checks each row against the layout of the table."""
 
     layout: TableLayout
     requested_names: Sequence[str]
     decimal_sign: str
     """Decimal sign of the numbers."""
-    columns_to_read: Sequence[int]
+    column_indices_to_read: Sequence[int]
     """Indices of the columns to read, which are the requested ones and a column of times."""
-    stamps: Mapping[int, StampReader] = field(default_factory=dict)
+    stamp_readers: Mapping[int, StampReader] = field(default_factory=dict)
     """Readers of the columns to read that contain times of day."""
-    checked_columns: Sequence[int] = ()
+    checked_column_indices: Sequence[int] = ()
     """Indices of the columns with a number in the first row, whether requested or not."""
     thousands_checks: dict[int, ThousandsCheck] = field(default_factory=dict)
     """Checks for thousands separators in the columns to read."""
-    sign_is_certain: bool = False
+    is_sign_certain: bool = False
     """Whether a cell has shown that the expected sign is the decimal sign."""
-    blank_line: int = 0
+    blank_line_number: int = 0
     """Number of the first empty line between lines of numbers; 0 if there is none."""
-    blank_count: int = 0
+    blank_interruption_count: int = 0
     """Number of interruptions of the numbers by empty lines."""
 
     def __post_init__(self) -> None:
-        first_cells = self.layout.first_cells
-        number_columns = (c for c, cell in enumerate(first_cells) if is_any_number(cell))
-        self.stamps = {c: StampReader() for c in self.columns_to_read if is_stamp(first_cells[c])}
-        self.checked_columns = sorted({*self.columns_to_read, *number_columns} - {*self.stamps})
+        first_cells = self.layout.first_row_cells
+        number_column_indices = (c for c, cell in enumerate(first_cells) if is_any_number(cell))
+        self.stamp_readers = {
+            c: StampReader() for c in self.column_indices_to_read if is_stamp(first_cells[c])
+        }
+        self.checked_column_indices = sorted(
+            {*self.column_indices_to_read, *number_column_indices} - {*self.stamp_readers}
+        )
         self.thousands_checks = {
             c: ThousandsCheck(self.decimal_sign)
-            for c in self.checked_columns
-            if c in self.columns_to_read
+            for c in self.checked_column_indices
+            if c in self.column_indices_to_read
         }
 
-    def title(self, column_index: int) -> str:
+    def column_name(self, column_index: int) -> str:
         """Return the name of a requested column for messages; its number if it has no name."""
-        if column_index in self.layout.columns:
-            return self.requested_names[self.layout.columns.index(column_index)]
+        if column_index in self.layout.requested_column_indices:
+            return self.requested_names[self.layout.requested_column_indices.index(column_index)]
         return f"#{column_index + 1}"
 
-    def fit(self, row: Sequence[str], line_number: int) -> list[str]:
+    def fit_row(self, row: Sequence[str], line_number: int) -> list[str]:
         """Return a row with empty cells cut or added at its end to fit the table's columns.
 
         Raise TableError if this does not make it fit.
         """
-        column_count = self.layout.width
+        column_count = self.layout.column_count
         fitted_cells = without_trailing_empty_cells(row, column_count)
-        if column_count - self.layout.optional_columns <= len(fitted_cells) < column_count:
+        if column_count - self.layout.optional_column_count <= len(fitted_cells) < column_count:
             fitted_cells += [""] * (column_count - len(fitted_cells))
         if len(fitted_cells) != column_count:
             raise TableError(
@@ -284,18 +291,18 @@ class _NumberRows:
                     line_number,
                     len(fitted_cells),
                     column_count,
-                    self.layout.titles_line,
+                    self.layout.titles_line_number,
                     self.layout.separator,
                 )
             )
         return fitted_cells
 
-    def numbers(self, row: Sequence[str], line_number: int) -> list[float]:
+    def parse_numbers(self, row: Sequence[str], line_number: int) -> list[float]:
         """Return the numbers in the checked cells of a row, or raise if a cell is not a number."""
         cell_numbers = []
-        for column_index in self.checked_columns:
+        for column_index in self.checked_column_indices:
             cell = row[column_index].strip()
-            if column_index not in self.columns_to_read:
+            if column_index not in self.column_indices_to_read:
                 if cell and not is_any_number(cell):
                     raise TableError(
                         f"line {line_number}: column {column_index + 1} is not a number{{cell}}, "
@@ -305,40 +312,42 @@ class _NumberRows:
                 cell_numbers.append(float("nan"))
                 continue
             try:
-                cell_numbers.append(number_of(cell, self.decimal_sign))
+                cell_numbers.append(parse_number(cell, self.decimal_sign))
             except ValueError:
                 raise self._invalid_number_error(cell, column_index, line_number) from None
         return cell_numbers
 
-    def stamp(self, row: Sequence[str], column_index: int, line_number: int) -> float:
+    def parse_stamp(self, row: Sequence[str], column_index: int, line_number: int) -> float:
         """Return the time stamp in a cell, in seconds since the column's first time stamp."""
         try:
-            return self.stamps[column_index](row[column_index])
+            return self.stamp_readers[column_index](row[column_index])
         except ValueError:
             cell = row[column_index]
         if is_stamp(cell):
             raise TableError(
-                f"line {line_number}: '{self.title(column_index)}' is of another day{{cell}}, and "
+                f"line {line_number}: '{self.column_name(column_index)}' is of another "
+                f"day{{cell}}, and "
                 "the order of day and month is not clear; write the date as 2026-11-25.",
                 cell,
             )
-        raise not_a_number_error(line_number, self.title(column_index), cell)
+        raise not_a_number_error(line_number, self.column_name(column_index), cell)
 
     def _invalid_number_error(self, cell: str, column_index: int, line_number: int) -> Exception:
         """Return the error for a cell that is not a number with the expected decimal sign."""
         if self.decimal_sign == POINT and is_number(cell, COMMA):
-            if self.layout.width == 1:
+            if self.layout.column_count == 1:
                 return TableError(comma_in_single_message(line_number))
             return _DecimalCommaError()
         if is_number(cell, POINT):
             return TableError(
-                f"line {line_number}: '{self.title(column_index)}' has a decimal point{{cell}}, "
+                f"line {line_number}: '{self.column_name(column_index)}' has a decimal "
+                f"point{{cell}}, "
                 "and other numbers have decimal commas; save the file with one of them, and "
                 "without "
                 "separators between thousands.",
                 cell,
             )
-        return not_a_number_error(line_number, self.title(column_index), cell)
+        return not_a_number_error(line_number, self.column_name(column_index), cell)
 
     def check_row_for_thousands(self, row: Sequence[str], line_number: int) -> None:
         """Update the checks for thousands separators with a row."""
@@ -347,19 +356,20 @@ class _NumberRows:
                 row[column_index], line_number
             ):
                 del self.thousands_checks[column_index]
-                self.sign_is_certain = True
+                self.is_sign_certain = True
 
     def check_thousands(self) -> None:
         """Raise TableError if a column's decimal signs may be thousands separators."""
         for column_index, thousands_check in self.thousands_checks.items():
             is_ambiguous = thousands_check.has_short_integer or (
-                self.decimal_sign == COMMA and not self.sign_is_certain
+                self.decimal_sign == COMMA and not self.is_sign_certain
             )
             if thousands_check.first_grouped_line and is_ambiguous:
                 sign_noun = "commas" if self.decimal_sign == COMMA else "points"
                 raise TableError(
                     f"line {thousands_check.first_grouped_line}: the {sign_noun} in "
-                    f"'{self.title(column_index)}' may be decimal signs or separators between "
+                    f"'{self.column_name(column_index)}' may be decimal signs or separators "
+                    "between "
                     "thousands, as each has three digits behind it; save the file with decimal "
                     "points and "
                     "without separators between thousands."
@@ -375,81 +385,94 @@ def _read_columns(
     decimal_sign: str,
 ) -> TextTable:
     """Read the requested columns and the column of times, with a given decimal sign."""
-    times_column = _times_column(layout)
-    columns_to_read = sorted({*layout.columns, *(() if times_column is None else (times_column,))})
-    number_rows = _NumberRows(layout, requested_names, decimal_sign, columns_to_read)
-    values_by_column = {column_index: array("d") for column_index in columns_to_read}
-    number_appends = [
-        (values_by_column[column_index].append, number_rows.checked_columns.index(column_index))
-        for column_index in columns_to_read
-        if column_index not in number_rows.stamps
+    times_column_index = _find_times_column_index(layout)
+    column_indices_to_read = sorted(
+        {
+            *layout.requested_column_indices,
+            *(() if times_column_index is None else (times_column_index,)),
+        }
+    )
+    row_reader = _NumberRowReader(layout, requested_names, decimal_sign, column_indices_to_read)
+    values_by_column = {column_index: array("d") for column_index in column_indices_to_read}
+    number_appenders = [
+        (
+            values_by_column[column_index].append,
+            row_reader.checked_column_indices.index(column_index),
+        )
+        for column_index in column_indices_to_read
+        if column_index not in row_reader.stamp_readers
     ]
-    stamp_appends = [
-        (values_by_column[column_index].append, column_index) for column_index in number_rows.stamps
+    stamp_appenders = [
+        (values_by_column[column_index].append, column_index)
+        for column_index in row_reader.stamp_readers
     ]
     pick_cells, convert_cell = (
-        itemgetter(*number_rows.checked_columns),
+        itemgetter(*row_reader.checked_column_indices),
         fast_number_converter(decimal_sign),
     )
-    has_single_column = len(number_rows.checked_columns) == 1
+    has_single_column = len(row_reader.checked_column_indices) == 1
     line_numbers = array("I")
-    empty_lines: list[int] = []
-    blank_line = 0
+    empty_line_numbers: list[int] = []
+    blank_line_number = 0
     with _open_lines(stream, encoding) as text_lines:
         for line_number, row in islice(
             rows_of_cells(_skip_excel_separator_line(text_lines), layout.separator),
-            layout.rows_before_numbers,
+            layout.row_count_before_numbers,
             None,
         ):
-            if len(row) != layout.width:
+            if len(row) != layout.column_count:
                 if not any(cell.strip() for cell in row) and len(row) < 2:
-                    blank_line = blank_line or line_number
+                    blank_line_number = blank_line_number or line_number
                     continue
-                row = number_rows.fit(row, line_number)  # noqa: PLW2901 - the row as the table has it
+                row = row_reader.fit_row(row, line_number)  # noqa: PLW2901 - the row as the table has it
             try:
-                numbers = (
+                row_numbers = (
                     [convert_cell(pick_cells(row))]
                     if has_single_column
                     else list(map(convert_cell, pick_cells(row)))
                 )
-                if any("_" in row[column_index] for column_index in number_rows.checked_columns):
-                    numbers = number_rows.numbers(row, line_number)  # Python would read 1_000
+                if any(
+                    "_" in row[column_index] for column_index in row_reader.checked_column_indices
+                ):
+                    row_numbers = row_reader.parse_numbers(
+                        row, line_number
+                    )  # Python would read 1_000
             except ValueError:
                 if not any(cell.strip() for cell in row):
-                    empty_lines.append(line_number)
+                    empty_line_numbers.append(line_number)
                     continue
-                numbers = number_rows.numbers(row, line_number)
-            if blank_line:
-                if layout.width == 1:
+                row_numbers = row_reader.parse_numbers(row, line_number)
+            if blank_line_number:
+                if layout.column_count == 1:
                     raise TableError(
-                        f"line {blank_line} is empty, so a value is missing or another record "
-                        "begins there; repair or remove it."
+                        f"line {blank_line_number} is empty, so a value is missing or another "
+                        "record begins there; repair or remove it."
                     )
-                number_rows.blank_line = number_rows.blank_line or blank_line
-                number_rows.blank_count += 1
-                blank_line = 0
-            if number_rows.thousands_checks:
-                number_rows.check_row_for_thousands(row, line_number)
-            if empty_lines:
-                for column_index in columns_to_read:
-                    values_by_column[column_index].extend(len(empty_lines) * [float("nan")])
-                line_numbers.extend(empty_lines)
-                empty_lines = []
-            for append_value, cell_index in number_appends:
-                append_value(numbers[cell_index])
-            for append_value, column_index in stamp_appends:
-                append_value(number_rows.stamp(row, column_index, line_number))
+                row_reader.blank_line_number = row_reader.blank_line_number or blank_line_number
+                row_reader.blank_interruption_count += 1
+                blank_line_number = 0
+            if row_reader.thousands_checks:
+                row_reader.check_row_for_thousands(row, line_number)
+            if empty_line_numbers:
+                for column_index in column_indices_to_read:
+                    values_by_column[column_index].extend(len(empty_line_numbers) * [float("nan")])
+                line_numbers.extend(empty_line_numbers)
+                empty_line_numbers = []
+            for append_value, cell_index in number_appenders:
+                append_value(row_numbers[cell_index])
+            for append_value, column_index in stamp_appenders:
+                append_value(row_reader.parse_stamp(row, column_index, line_number))
             line_numbers.append(line_number)
             if len(line_numbers) > max_rows:
                 break
-    number_rows.check_thousands()
-    return _text_table(
+    row_reader.check_thousands()
+    return _build_text_table(
         layout,
         requested_names,
         values_by_column,
         np.frombuffer(line_numbers, np.uint32),
-        times_column,
-        number_rows,
+        times_column_index,
+        row_reader,
     )
 
 
@@ -463,20 +486,23 @@ def _skip_excel_separator_line(lines: Iterator[str]) -> Iterator[str]:
     yield from lines
 
 
-def _blank_lines_remark(rows: _NumberRows) -> str:
+def _blank_lines_remark(row_reader: _NumberRowReader) -> str:
     """Return the remark on empty lines between the numbers; empty if there are none."""
-    if not rows.blank_count:
+    if not row_reader.blank_interruption_count:
         return ""
     return (
-        f"The lines of numbers are interrupted by empty lines, {rows.blank_count} times, first in "
-        f"line {rows.blank_line}; they were read as one record without a gap."
+        "The lines of numbers are interrupted by empty lines, "
+        f"{row_reader.blank_interruption_count} times, first in "
+        f"line {row_reader.blank_line_number}; they were read as one record without a gap."
     )
 
 
-def _times_column(layout: TableLayout) -> int | None:
+def _find_times_column_index(layout: TableLayout) -> int | None:
     """Return the index of a column of times that is not requested; None if there is none."""
-    for column_index, cell in enumerate(layout.first_cells):
-        if column_index in layout.columns or not (is_any_number(cell) or is_stamp(cell)):
+    for column_index, cell in enumerate(layout.first_row_cells):
+        if column_index in layout.requested_column_indices or not (
+            is_any_number(cell) or is_stamp(cell)
+        ):
             continue
         if is_stamp(cell):
             return column_index
@@ -498,36 +524,40 @@ def _time_unit_s(layout: TableLayout, column_index: int) -> float | None:
 
 def _unit_in_file(layout: TableLayout, column_index: int) -> str:
     """Return the unit of a column that the file states; "s" for times of day."""
-    if is_stamp(layout.first_cells[column_index]):
+    if is_stamp(layout.first_row_cells[column_index]):
         return "s"
     unit_in_row = layout.units[column_index] if layout.units else ""
-    unit_in_head = layout.labview.text("Y_Unit_Label", column_index) if layout.labview else ""
+    unit_in_head = (
+        layout.labview_head.head_text("Y_Unit_Label", column_index) if layout.labview_head else ""
+    )
     unit_in_title = stated_unit_of(layout.titles[column_index]) if layout.titles else ""
     return unit_in_row or unit_in_head or unit_in_title
 
 
-def _text_table(
+def _build_text_table(
     layout: TableLayout,
     requested_names: Sequence[str],
     values_by_column: Mapping[int, "array[float]"],
     line_numbers: npt.NDArray[np.uint32],
-    times_column: int | None,
-    rows: _NumberRows,
+    times_column_index: int | None,
+    row_reader: _NumberRowReader,
 ) -> TextTable:
     """Return the values that were read as a table with titles, units, rates and times."""
     table_columns = {}
-    for requested_name, column_index in zip(requested_names, layout.columns, strict=True):
+    for requested_name, column_index in zip(
+        requested_names, layout.requested_column_indices, strict=True
+    ):
         period_s = start_ns = None
-        if layout.labview is not None:
-            x_dimension = layout.labview.text("X_Dimension", column_index)
+        if layout.labview_head is not None:
+            x_dimension = layout.labview_head.head_text("X_Dimension", column_index)
             if x_dimension.lower() not in _TIME_DIMENSIONS:
                 raise TableError(
                     f"'{requested_name}' is not a function of time by the X_Dimension of the "
                     f"header{{cell}}; give measured samples.",
                     x_dimension,
                 )
-            period_s = layout.labview.number("Delta_X", column_index)
-            start_ns = layout.labview.start_ns(column_index)
+            period_s = layout.labview_head.head_number("Delta_X", column_index)
+            start_ns = layout.labview_head.start_ns(column_index)
         table_columns[requested_name] = TableColumn(
             values=np.frombuffer(values_by_column[column_index]),
             title=layout.titles[column_index] if layout.titles else "",
@@ -537,11 +567,17 @@ def _text_table(
         )
     table_times = None
     if (
-        times_column is not None
-        and np.isfinite(time_values := np.frombuffer(values_by_column[times_column])).any()
+        times_column_index is not None
+        and np.isfinite(time_values := np.frombuffer(values_by_column[times_column_index])).any()
     ):
-        times_title = layout.titles[times_column] if layout.titles else f"#{times_column + 1}"
-        table_times = TableTimes(times_title, time_values, _time_unit_s(layout, times_column))
+        times_title = (
+            layout.titles[times_column_index] if layout.titles else f"#{times_column_index + 1}"
+        )
+        table_times = TableTimes(times_title, time_values, _time_unit_s(layout, times_column_index))
     return TextTable(
-        table_columns, line_numbers, layout.width, table_times, _blank_lines_remark(rows)
+        table_columns,
+        line_numbers,
+        layout.column_count,
+        table_times,
+        _blank_lines_remark(row_reader),
     )

@@ -24,7 +24,7 @@ class StampReader:
     """Reader of the time stamps in one column, in seconds since the column's first one."""
 
     def __init__(self) -> None:
-        self._first: re.Match[str] | None = None
+        self._first_stamp: re.Match[str] | None = None
 
     def __call__(self, cell: str) -> float:
         """Return the seconds from the column's first stamp to this one; NaN for an empty cell.
@@ -38,7 +38,7 @@ class StampReader:
         stamp = _STAMP_PATTERN.fullmatch(stamp_text)
         if stamp is None:
             raise ValueError(stamp_text)
-        first_stamp = self._first = self._first or stamp
+        first_stamp = self._first_stamp = self._first_stamp or stamp
         day_difference = 0
         if stamp["date"] != first_stamp["date"]:
             day_difference = _day_number(stamp["date"]) - _day_number(first_stamp["date"])
@@ -47,7 +47,11 @@ class StampReader:
             + _seconds_since_midnight(stamp)
             - _seconds_since_midnight(first_stamp)
         )
-        return (second_difference * 10**9 + _nanoseconds(stamp) - _nanoseconds(first_stamp)) / 1e9
+        return (
+            second_difference * 10**9
+            + _fraction_nanoseconds(stamp)
+            - _fraction_nanoseconds(first_stamp)
+        ) / 1e9
 
 
 def _seconds_since_midnight(stamp: re.Match[str]) -> int:
@@ -58,7 +62,7 @@ def _seconds_since_midnight(stamp: re.Match[str]) -> int:
     return 3600 * hour_of_day + 60 * int(stamp["minute"]) + int(stamp["second"])
 
 
-def _nanoseconds(stamp: re.Match[str]) -> int:
+def _fraction_nanoseconds(stamp: re.Match[str]) -> int:
     """Return the fractional part of a time stamp's seconds, in nanoseconds."""
     return int(f"{stamp['fraction'] or '':0<9}"[:9])
 

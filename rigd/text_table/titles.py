@@ -3,11 +3,11 @@
 import re
 from typing import Final
 
-_BRACKETS_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
+_BRACKETED_UNIT_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
 """Pattern of brackets with their content at the end of a title."""
 _PRODUCT_SIGN_PATTERN: Final = re.compile(r"[\s.·⋅*-]")
 """Pattern of product signs and blanks in a unit."""
-_AFTER_SLASH_PATTERN: Final = re.compile(r"(?:[/,]|\bin\b)\s*([^\s/,]+)\s*$")
+_UNIT_AFTER_SLASH_PATTERN: Final = re.compile(r"(?:[/,]|\bin\b)\s*([^\s/,]+)\s*$")
 """Pattern of the last word of a title after a slash, a comma or the word "in"."""
 
 _TIME_TITLE_PATTERN: Final = re.compile(
@@ -41,7 +41,7 @@ TIME_UNITS_S: Final = {
 }
 """Length in seconds of each unit of time, by spelling."""
 
-_OTHER_UNITS: Final = (
+_NON_TIME_UNITS: Final = (
     "rad", "mrad", "urad", "deg", "degree", "degrees", "radian", "radians", "arcmin", "arcsec",
     "rev", "grad", "°", "nm", "mnm", "unm", "ncm", "nmm", "knm", "newtonmeter", "newtonmetre",
     "lbfin", "ozfin", "n", "mn", "kn", "lbf", "v", "mv", "volt", "volts", "a", "ma", "amp", "mm",
@@ -67,16 +67,18 @@ def stated_unit_of(title: str) -> str:
     >>> stated_unit_of("Angle [deg]"), stated_unit_of("t/ms"), stated_unit_of("Rig/Angle")
     ('deg', 'ms', '')
     """
-    unit_match = _BRACKETS_PATTERN.search(title) or _AFTER_SLASH_PATTERN.search(title)
+    unit_match = _BRACKETED_UNIT_PATTERN.search(title) or _UNIT_AFTER_SLASH_PATTERN.search(title)
     if unit_match is None:
         return ""
-    is_certain = is_unit(unit_match[1]) or unit_match[0].startswith("[")
-    return unit_match[1].strip() if is_certain else ""
+    is_certain_unit = is_unit(unit_match[1]) or unit_match[0].startswith("[")
+    return unit_match[1].strip() if is_certain_unit else ""
 
 
 def is_unit(cell: str) -> bool:
     """Return whether a cell contains a known unit, with or without brackets."""
-    return _plain_unit(cell) in TIME_UNITS_S or _plain_unit(cell) in _OTHER_UNITS
+    return (
+        _plain_unit_spelling(cell) in TIME_UNITS_S or _plain_unit_spelling(cell) in _NON_TIME_UNITS
+    )
 
 
 def bare_unit(cell: str) -> str:
@@ -89,7 +91,7 @@ def bare_unit(cell: str) -> str:
     )
 
 
-def _plain_unit(cell: str) -> str:
+def _plain_unit_spelling(cell: str) -> str:
     """Return a unit in lower case, without brackets and product signs."""
     return _PRODUCT_SIGN_PATTERN.sub(
         "", bare_unit(cell).lower().replace("µ", "u").replace("μ", "u")
@@ -103,4 +105,4 @@ def is_title_of_times(title: str) -> bool:
 
 def time_unit_s(unit: str) -> float | None:
     """Return the length of a unit of time in seconds; None if the unit is unknown."""
-    return TIME_UNITS_S.get(_plain_unit(unit))
+    return TIME_UNITS_S.get(_plain_unit_spelling(unit))

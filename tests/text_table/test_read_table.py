@@ -40,8 +40,8 @@ def test_headers_and_rows_of_units(head, units):
     assert [found.columns[name].unit for name in ("t", "angle", "torque")] == (
         ["s", "rad", "Nm"] if in_row else ["", "", ""]
     )
-    assert found.width == 3
-    assert found.lines.tolist() == [
+    assert found.column_count == 3
+    assert found.line_numbers.tolist() == [
         (head + units).count("\n") + 2, (head + units).count("\n") + 3
     ]  # fmt: skip
 
@@ -142,7 +142,7 @@ def test_missing_column_is_named_with_the_existing_ones():
     with pytest.raises(MissingColumnError) as refusal:
         table("Rig 4\nt;q\n0;1\n1;2\n", "t", "angle")
     assert str(refusal.value) == "has no channel 'angle'; it has 't', 'q' (line 2)."
-    assert refusal.value.unquoted() == "has no column 'angle'."
+    assert refusal.value.unquoted_message() == "has no column 'angle'."
 
 
 def test_times_of_day_are_seconds():
