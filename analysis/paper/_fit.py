@@ -207,7 +207,9 @@ def fit_many(
         thinned_response_grid = ResponseGrid(s[point_index])
         thinned_and_full_grids.append(
             (
-                _FrequencyGrid(thinned_grid, undamped_plant, response[point_index], point_weights),
+                _FrequencyGrid(
+                    thinned_response_grid, undamped_plant, response[point_index], point_weights
+                ),
                 _FrequencyGrid(full_response_grid, undamped_plant, response, full_grid_weights),
             )
         )

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from math import isnan
 from typing import Any
 
-from rigd.estimates import ReportedMode, modes_from_json, unseen_modes
+from rigd.estimates import ReportedMode, modes_from_json, unseen_modes_text
 from rigd.session._validity import Validity
 
 
@@ -38,7 +38,7 @@ def estimate_lines(
             change_text = "" if earlier_mode is None else _change_text(earlier_mode, mode)
             doubt_text = f" (doubtful: {mode.flag})" if mode.flag else ""
             report_lines.append(f"  {mode.line()}{change_text}{doubt_text}")
-    if unseen_text := unseen_modes(modes):
+    if unseen_text := unseen_modes_text(modes):
         report_lines.append(f"  not visible so far: {unseen_text}")
     if uniform_beam := Validity.from_document(fit_document.get("validity")).uniform_beam:
         report_lines.append(f"  {uniform_beam.sentence}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.estimates import Estimate, ReportedMode, modes_from_json, unseen_modes
+from rigd.estimates import Estimate, ReportedMode, modes_from_json, unseen_modes_text
 from rigd.session import Validity
 from rigd.units import suffix_of, unit_of, with_percentage
 from rigd.view._session_info import escape_markdown
@@ -200,7 +200,7 @@ def fit_table(fit: Fit | None) -> str:
         paragraphs.append(
             _markdown_table("mode", "frequency (Hz)", "damping ratio (%)", table_rows=mode_rows)
         )
-    if modes_not_visible := unseen_modes(modes):
+    if modes_not_visible := unseen_modes_text(modes):
         paragraphs.append(f"Not visible so far: {modes_not_visible}.")
     if mode_rows:
         validity = Validity.from_document(fit.get("validity"))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from cases import further
 
-from rigd.check_rows import CheckResult, overall
+from rigd.check_rows import CheckResult, overall_verdict
 from rigd.checks.devices import inspect_devices
 from rigd.devices import reset_drive
 from rigd.devices.contracts import DeviceError
@@ -43,7 +43,7 @@ def test_a_fault_is_found_and_not_reset(profile, monkeypatch):
 
     monkeypatch.setattr("rigd.checks.devices.EXCHANGE_CHECK_TICKS", 100)
     rows = inspect_devices(profile)
-    assert overall(rows) == "ok", rows
+    assert overall_verdict(rows) == "ok", rows
     found = {(row.group, row.what): row.found for row in rows}
     assert "rigd simulate, in lock-step" in found["link", "what moves"]
     assert found["drive", "supported modes"] == "0x200"
@@ -59,7 +59,7 @@ def test_a_fault_is_found_and_not_reset(profile, monkeypatch):
 
     assert "was in fault: current at the output" in reset_drive(profile.rig)
     assert "not in fault" in reset_drive(profile.rig)
-    assert overall(inspect_devices(profile)) == "ok"
+    assert overall_verdict(inspect_devices(profile)) == "ok"
 
 
 def test_reset_without_a_bus(can_profile):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.check_rows import CheckResult, overall
+from rigd.check_rows import CheckResult, overall_verdict
 from rigd.checks.devices import inspect_devices
 from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import Watchdog
@@ -21,7 +21,7 @@ def test_a_healthy_rig(can_profile, stand_ins):
     acquisition = replace(can_profile.rig.acquisition, deadline_us=1e6)
     rig = replace(can_profile.rig, acquisition=acquisition)
     rows = inspect_devices(replace(can_profile, rig=rig))
-    assert overall(rows) == "ok"
+    assert overall_verdict(rows) == "ok"
     found = by_name(rows)
     assert found["link", "what moves"].found == "the hardware"
     assert found["link", "CAN"].found == "can0 (socketcan)"
@@ -83,7 +83,7 @@ def test_failure_to_close_a_device_leaves_no_other_open(can_profile, stand_ins):
     stand_ins.drive.fails_at["close"] = DeviceError("it will not let go")
     rows = inspect_devices(can_profile)
     assert stand_ins.closed
-    assert overall(rows) == "failed"
+    assert overall_verdict(rows) == "failed"
 
 
 def test_failure_to_open_devices(can_profile, monkeypatch):
@@ -223,6 +223,6 @@ def test_replies_after_the_deadline_fail(can_profile, stand_ins):
 
 def test_the_simulation_in_this_process():
     rows = by_name(inspect_devices(load_profile("sim")))
-    assert overall(rows.values()) == "ok"
+    assert overall_verdict(rows.values()) == "ok"
     assert rows["drive", "connection"].found == "simulated in this process"
     assert rows["exchange", "ticks"].verdict is CheckResult.SKIPPED

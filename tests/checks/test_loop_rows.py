@@ -6,7 +6,7 @@ import pytest
 from cases import further
 
 from rigd.beam import Damping
-from rigd.check_rows import CheckResult, overall
+from rigd.check_rows import CheckResult, overall_verdict
 from rigd.checks.closed_loop import margin_rows, stability_rows
 from rigd.profile import load_profile
 
@@ -27,7 +27,7 @@ def with_control(profile, **changes):
 @pytest.mark.parametrize("name", ["sim", further("antenna_can"), further("antenna_serial")])
 def test_the_shipped_loops_are_fine(name):
     rows = list(loop_rows(load_profile(name)))
-    assert overall(rows) == "ok"
+    assert overall_verdict(rows) == "ok"
     assert [row.what for row in rows[1:5]] == [
         "gain margin",
         "phase margin",
@@ -62,7 +62,7 @@ def test_a_margin_below_its_limit_is_a_warning(sim):
     low = {(row.group, row.what) for row in rows if row.verdict is CheckResult.WARNING}
     assert ("loop, torque reading", "gain margin") in low
     assert ("loop, torque command", "phase margin") in low
-    assert overall(rows) == "warnings"
+    assert overall_verdict(rows) == "warnings"
 
 
 def test_a_delay_margin_below_a_period_is_a_warning(sim):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigd.beam import mode_shape, undamped_frequencies_rad_s
-from rigd.check_rows import CheckResult, CheckRow, overall
+from rigd.check_rows import CheckResult, CheckRow, overall_verdict
 from rigd.checks import check_without_devices, run_offline_checks
 from rigd.checks.offline import axis_tilt_rows, profile_rows, record_rows, wiring_rows
 from rigd.devices.canbus import bus_load
@@ -27,10 +27,10 @@ def test_the_worst_row_is_the_verdict():
     ok, skipped, warning, fail = map(
         row, (CheckResult.OK, CheckResult.SKIPPED, CheckResult.WARNING, CheckResult.FAIL)
     )
-    assert overall([]) == "ok"
-    assert overall([ok, skipped]) == "ok"
-    assert overall([ok, warning, skipped]) == "warnings"
-    assert overall([warning, fail, ok]) == "failed"
+    assert overall_verdict([]) == "ok"
+    assert overall_verdict([ok, skipped]) == "ok"
+    assert overall_verdict([ok, warning, skipped]) == "warnings"
+    assert overall_verdict([warning, fail, ok]) == "failed"
 
 
 def test_one_warning_names_all_assumed_numbers(can_profile):
@@ -44,7 +44,7 @@ def test_one_warning_names_all_assumed_numbers(can_profile):
 
 def test_a_profile_without_assumptions_has_no_warning(can_profile):
     sources = dict.fromkeys(can_profile.sources, "measured")
-    assert overall(profile_rows(replace(can_profile, sources=sources))) == "ok"
+    assert overall_verdict(profile_rows(replace(can_profile, sources=sources))) == "ok"
 
 
 def test_the_longest_record_can_be_analysed(can_profile):

@@ -8,7 +8,7 @@ import pytest
 from cases import further
 from eds_files import eds_path
 
-from rigd.check_rows import CheckResult, overall
+from rigd.check_rows import CheckResult, overall_verdict
 from rigd.checks import check_without_devices, run_offline_checks
 from rigd.control import ControlDesignError
 from rigd.devices import MAY_BE_UNKNOWN, open_devices, unknown_values
@@ -220,7 +220,7 @@ def test_an_unknown_value_is_named_where_needed(unknown, tmp_path, key):
 def test_all_values_unknown_and_on_a_simulated_rig(unknown, tmp_path):
     assert unknown_values(load_profile(unknown(*MAY_BE_UNKNOWN)).rig) == tuple(MAY_BE_UNKNOWN)
     profile = load_profile(unknown("motor.inertia_kg_m2", base=load_profile("sim")))
-    assert overall(check_without_devices(profile, None)) == "failed"
+    assert overall_verdict(check_without_devices(profile, None)) == "failed"
     with pytest.raises(DeviceError, match="inertia_kg_m2 is unknown; enter its value"):
         open_devices(profile.rig)
 
