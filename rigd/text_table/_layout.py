@@ -215,7 +215,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
         nonempty_rows = [row for row in text_rows if any(row.cells)]
         if labview_head is not None:
             nonempty_rows = [
-                row for row in nonempty_rows if row.line_number > labview_head.last_line
+                row for row in nonempty_rows if row.line_number > labview_head.last_line_number
             ]
         try:
             possible_layout = _layout_with_separator(

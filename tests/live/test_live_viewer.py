@@ -96,10 +96,10 @@ def test_error_without_vulkan_names_the_missing_package(tmp_path, monkeypatch, a
         assert eventually(lambda: window.exit_code is not None)
     finally:
         window.close()
-    assert window.without_graphics
+    assert window.lacks_graphics
     assert window.exit_code not in (0, None)
-    assert "no Vulkan driver" in window.fault
-    assert "mesa-vulkan-drivers" in window.fault
+    assert "no Vulkan driver" in window.closing_reason
+    assert "mesa-vulkan-drivers" in window.closing_reason
 
 
 @pytest.mark.further  # as a server that is killed

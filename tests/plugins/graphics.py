@@ -23,7 +23,7 @@ class ControlEnded(Protocol):
 
 def viewer_ended(viewer: ControlEnded) -> NoReturn:
     """End a test whose viewer has: skipped if the computer lacks graphics, failed otherwise."""
-    if viewer.without_graphics:
+    if viewer.lacks_graphics:
         pytest.skip(NO_GRAPHICS)
     pytest.fail(viewer.last_log_lines)
 
