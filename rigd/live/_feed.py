@@ -34,8 +34,8 @@ class DrawingStream:
     """Sends the drawings of one session after another to the present Rerun server.
 
     A server that ends is replaced. `connections` counts the connections so far, each of which began
-    with the drawings of `Scene.frame`; `stalled` states that the last drawings are not yet
-    accepted.
+    with the drawings of `Scene.initial_drawings`; `stalled` states that the last drawings are not
+    yet accepted.
     """
 
     def __init__(self, server_program: RerunServer) -> None:

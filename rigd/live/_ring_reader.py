@@ -92,11 +92,13 @@ class SessionRecordReader:
         signal_drawings: list[Drawing] = []
         sample_count = newly_shown_count = 0
         for event_records in ring_readers[EVENT].read_records(read_events):
-            note_drawings += scene.events([Note(e.t_ns, e.level, e.message) for e in event_records])
+            note_drawings += scene.event_drawings(
+                [Note(e.t_ns, e.level, e.message) for e in event_records]
+            )
         for timing_records in ring_readers[TIMING].read_records(decode_timings):
-            signal_drawings += scene.timings(timing_records)
+            signal_drawings += scene.timing_drawings(timing_records)
         for sample_records in ring_readers[SAMPLE].read_records(decode_samples):
-            signal_drawings += scene.samples(sample_records)
+            signal_drawings += scene.sample_drawings(sample_records)
             self.t_ns = int(sample_records["t_ns"][-1])
             sample_count += len(sample_records)
             newly_shown_count += min(

@@ -175,7 +175,9 @@ class _Publisher:
             session, self._channels, last_response(session, self._last_response)
         )
         self._server_program.count_session()
-        self._drawing_stream.begin(session.recording_id, self._shown_session.reader.scene.frame)
+        self._drawing_stream.begin(
+            session.recording_id, self._shown_session.reader.scene.initial_drawings
+        )
         self._show_new_records()
         self._supervisor_connection.send(LiveSessionShown(session.recording_id))
 
@@ -270,9 +272,9 @@ class _ShownSession:
         now_s = time.monotonic()
         if self._health_reader.is_due(now_s):
             rig_health = self._health_reader.read(now_s, self.dropped_samples)
-            queued_drawings += self.reader.scene.health(self.reader.t_ns, rig_health)
+            queued_drawings += self.reader.scene.health_drawings(self.reader.t_ns, rig_health)
         banner_state = SUPERVISOR_LOST if self.supervisor_lost else self._state_reader.read(now_s)
-        queued_drawings += self.reader.scene.state(self.reader.t_ns, banner_state)
+        queued_drawings += self.reader.scene.state_drawings(self.reader.t_ns, banner_state)
         self.backlog.put_required(new_drawings.note_drawings)
         self.backlog.put(queued_drawings, new_drawings.new_sample_count)
         self._store_sample_counts()
@@ -290,13 +292,17 @@ class _ShownSession:
         """Queue the drawings and log lines of estimated touches."""
         view_scene, t_ns = self.reader.scene, self.reader.t_ns
         log_notes = [Note(t_ns, "info", touch_line(touch)) for touch in touches]
-        self.backlog.put_required([*view_scene.touches(touches), *view_scene.events(log_notes)])
+        self.backlog.put_required(
+            [*view_scene.touch_drawings(touches), *view_scene.event_drawings(log_notes)]
+        )
 
     def show_fit(self, fit: "Mapping[str, Any]") -> None:
         """Queue the drawings and log lines of a fit of the record so far."""
         view_scene, t_ns = self.reader.scene, self.reader.t_ns
         log_notes = [Note(t_ns, "info", fit_line) for fit_line in fit["text"]]
-        self.backlog.put_required([*view_scene.fit(fit), *view_scene.events(log_notes)])
+        self.backlog.put_required(
+            [*view_scene.fit_drawings(fit), *view_scene.event_drawings(log_notes)]
+        )
 
     def finish(self, end_message: LiveSessionEnded) -> None:
         """Queue the drawings of the session's remaining records and of its outcome."""
@@ -307,13 +313,19 @@ class _ShownSession:
         if self.supervisor_lost:
             is_torque_off = self._shared_state[StateField.PHASE] == Phase.OFF
             banner_state = SUPERVISOR_LOST_TORQUE_OFF if is_torque_off else SUPERVISOR_LOST
-            self.backlog.put_required(view_scene.events([Note(t_ns, "error", banner_state.reason)]))
+            self.backlog.put_required(
+                view_scene.event_drawings([Note(t_ns, "error", banner_state.reason)])
+            )
         elif end_message.outcome:
             self.backlog.put_required(
-                view_scene.events([outcome_note(t_ns, end_message.outcome, end_message.reason)])
+                view_scene.event_drawings(
+                    [outcome_note(t_ns, end_message.outcome, end_message.reason)]
+                )
             )
         # They follow all queued drawings, which show a running session.
-        self.backlog.put([*view_scene.finish(), *view_scene.state(t_ns, banner_state)], 0)
+        self.backlog.put(
+            [*view_scene.final_drawings(), *view_scene.state_drawings(t_ns, banner_state)], 0
+        )
         self.has_ended = True
         self._queue_quick_look()
 
@@ -327,7 +339,9 @@ class _ShownSession:
             return
         view_scene, t_ns = self.reader.scene, self.reader.t_ns
         self.backlog.put_required(
-            view_scene.events([Note(t_ns, "info", text_line) for text_line in quick_look["text"]])
+            view_scene.event_drawings(
+                [Note(t_ns, "info", text_line) for text_line in quick_look["text"]]
+            )
         )
 
     def send(self, drawing_stream: DrawingStream, *, is_new_connection: bool) -> None:

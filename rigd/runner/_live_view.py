@@ -139,7 +139,7 @@ def describe_planned_session(
     return SessionDescription(
         name=session_order.path.stem,
         rate_hz=rig_parameters.rate_hz,
-        ticks=excitation.reference_rad.size,
+        scheduled_ticks=excitation.reference_rad.size,
         sweep=sweep_ticks(excitation.segments),
         beam=rig_parameters.beam,
         damping=rig_parameters.damping,
@@ -148,12 +148,12 @@ def describe_planned_session(
         torque_delay_s=rig_parameters.sensor.delay_s,
         excitation=excitation.kind,
         sweep_hz=linear_sweep_band_hz(excitation.kind, excitation.parameters),
-        back=excitation.segments.get("back"),
+        return_sweep=excitation.segments.get("back"),
         specimen=dict(session_order.notes).get("specimen", ""),
         limits=gauge_limits(session_order.profile),
         thermal_time_constant_s=rig_parameters.motor.thermal_time_constant_s,
-        absent=frozenset(absent_plots),
-        fit_modes=_fit_mode_count(session_order),
+        absent_components=frozenset(absent_plots),
+        fitted_mode_count=_fit_mode_count(session_order),
     )
 
 

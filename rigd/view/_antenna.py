@@ -46,27 +46,27 @@ LABEL_ENTITY: Final = f"{ANTENNA_ENTITY}/label"
 TOUCH_ENTITY: Final = f"{ANTENNA_ENTITY}/touch"
 """Entity path in Rerun of the drawings of touches."""
 
-ENLARGEMENT: Final = 2.0
+DRAWING_ENLARGEMENT: Final = 2.0
 """Factor by which the motor angle and the beam's deflection are enlarged in the drawing.
 
 The default chirp turns the motor by 25 mrad, and at the first resonance the tip swings by
 a third of the beam's length. With this factor the motor's motion is visible, and the tip's motion
 stays inside the drawing."""
-_UNSCALED_EXCITATIONS: Final = ("move", "touch")
+_EXCITATIONS_DRAWN_TO_SCALE: Final = ("move", "touch")
 """Kinds of excitation (moves and touch searches) that are drawn without enlargement."""
 VIEW_TITLE: Final = "Antenna"
 """Title of the 3D view in Rerun's window."""
 
-DRAWN_HZ: Final = 20.0
+BEAM_DRAWING_RATE_HZ: Final = 20.0
 """Rate at which the beam is drawn, in hertz."""
-TRAIL_S: Final = 0.5
+TRAIL_DURATION_S: Final = 0.5
 """Time for which each drawn beam line stays visible, so that the lines show the range of motion."""
 
-_SHAPE_HZ: Final = 100.0
+_SHAPE_RATE_HZ: Final = 100.0
 """Rate at which the beam's deflection is computed, in hertz.
 
 It is higher than the rate of drawing, so that the largest deflection of the tip is not missed."""
-_LABEL_HZ: Final = 4.0
+_LABEL_RATE_HZ: Final = 4.0
 """Rate at which the label with the tip's deflection, and the trail of past lines, are sent."""
 _MAX_INTERPOLATED_GAP_S: Final = 10.0
 """Longest gap between samples over which the motor angle is interpolated."""
@@ -75,7 +75,7 @@ _ASSUMED_DAMPING_RATIO: Final = 2e-3
 
 It is twice the lowest damping ratio in the reference paper."""
 
-_STORED_LINES_S: Final = 30.0
+_LINE_STORAGE_S: Final = 30.0
 """Time for which drawn beam lines are stored: a touch is estimated later than it happens."""
 _ARROW_LENGTH_PER_N: Final = 0.2
 """Length of the arrow of a contact force per newton, in beam lengths."""
@@ -98,28 +98,28 @@ class Antenna:
         self._filter = DeflectionFilter(session.beam, damping, session.rate_hz)
         self._rate_hz = session.rate_hz
         self._length_m = session.beam.length_m
-        self._shape_ticks = max(1, round(session.rate_hz / _SHAPE_HZ))
-        shape_hz = session.rate_hz / self._shape_ticks
-        self._shapes_per_drawing = math.ceil(shape_hz / DRAWN_HZ)
-        self._shapes_per_label = math.ceil(shape_hz / _LABEL_HZ)
+        self._shape_ticks = max(1, round(session.rate_hz / _SHAPE_RATE_HZ))
+        shape_rate_hz = session.rate_hz / self._shape_ticks
+        self._shapes_per_drawing = math.ceil(shape_rate_hz / BEAM_DRAWING_RATE_HZ)
+        self._shapes_per_label = math.ceil(shape_rate_hz / _LABEL_RATE_HZ)
         self._shape_count = 0
-        trail_shapes = max(1, round(shape_hz * TRAIL_S))
-        self._tips_m: collections.deque[float] = collections.deque(maxlen=trail_shapes)
-        self._to_scale = session.excitation in _UNSCALED_EXCITATIONS
+        trail_shape_count = max(1, round(shape_rate_hz * TRAIL_DURATION_S))
+        self._tips_m: collections.deque[float] = collections.deque(maxlen=trail_shape_count)
+        self._is_to_scale = session.excitation in _EXCITATIONS_DRAWN_TO_SCALE
         self._newest: tuple[int, RealArray] | None = (
             None  # tick, time and angle of the newest sample
         )
         self._waiting: RealArray = np.zeros((0, 2))  # times and angles since the last shape
         self._trail: list[_TimedLines] = []  # lines that are not sent yet
         self._shapes: collections.deque[_TimedLines] = collections.deque(
-            maxlen=round(_STORED_LINES_S * DRAWN_HZ)
+            maxlen=round(_LINE_STORAGE_S * BEAM_DRAWING_RATE_HZ)
         )
 
-    def frame(self) -> list[Drawing]:
+    def initial_drawings(self) -> list[Drawing]:
         """Return functions that draw the motor and set the style of the beam's lines."""
         return static_drawings()
 
-    def samples(self, samples: Records) -> list[Drawing]:
+    def sample_drawings(self, samples: Records) -> list[Drawing]:
         """Return functions that draw the bent beam for new samples (n,) of ``SAMPLE_DTYPE``.
 
         The samples are in order of time. The beam is drawn 20 times per second. Across gaps
@@ -140,13 +140,13 @@ class Antenna:
             self._shape_count += 1
             t_ns, angle_rad = int(shape_samples[-1, 0]), float(shape_samples[-1, 1])
             if self._shape_count % self._shapes_per_drawing == 0:
-                deflection = deflection_m / self._length_m
-                scaled_lines = (unscaled_lines if self._to_scale else enlarged_lines)(
-                    angle_rad, deflection
+                relative_deflection = deflection_m / self._length_m
+                drawn_lines = (lines_to_scale if self._is_to_scale else enlarged_lines)(
+                    angle_rad, relative_deflection
                 )
-                timed_lines.append((t_ns, scaled_lines))
+                timed_lines.append((t_ns, drawn_lines))
             if self._shape_count % self._shapes_per_label == 0:
-                label_text = tip_label(max(self._tips_m), to_scale=self._to_scale)
+                label_text = tip_label(max(self._tips_m), is_to_scale=self._is_to_scale)
                 label_drawings.append(partial(_draw_label, t_ns=t_ns, label_text=label_text))
         self._trail += [(t_ns, both_lines[1:]) for t_ns, both_lines in timed_lines]
         self._shapes += timed_lines
@@ -158,7 +158,7 @@ class Antenna:
             self._trail = []
         return drawings + label_drawings
 
-    def touch(self, touch: Mapping[str, Any]) -> list[Drawing]:
+    def touch_drawings(self, touch: Mapping[str, Any]) -> list[Drawing]:
         """Return the function that draws a touch: contact point with uncertainty, and force.
 
         The result is empty if point or time of the touch are unknown, or if the beam line at that
@@ -181,7 +181,7 @@ class Antenna:
             return []  # the shape of that time is no longer stored
         time_fraction = min((t_ns - earlier_ns) / (later_ns - earlier_ns), 1.0)
         beam_line = (1 - time_fraction) * earlier_lines[1] + time_fraction * later_lines[1]
-        displacement = later_lines[1] - earlier_lines[1]
+        interval_displacement = later_lines[1] - earlier_lines[1]
         beam_positions = np.linspace(0.0, 1.0, len(beam_line))
         relative_positions = (
             np.array([touch_position["value"], *touch_position["interval_95"]]) / self._length_m
@@ -193,7 +193,7 @@ class Antenna:
                     for coordinate in lines.T
                 ]
             )
-            for lines in (beam_line, displacement)
+            for lines in (beam_line, interval_displacement)
         )
         touch_force = touch.get("force_n")
         arrow_length = (
@@ -262,7 +262,7 @@ def view() -> "rrb.Spatial3DView":
         overrides={
             TRAIL_ENTITY: rrb.VisibleTimeRanges(
                 timeline=TIMELINE,
-                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
+                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_DURATION_S),
                 end=rrb.TimeRangeBoundary.cursor_relative(),
             )
         },
@@ -283,41 +283,47 @@ def enlarged_lines(angle_rad: float, deflection_per_length: RealArray) -> npt.ND
     x = np.linspace(0.0, 1.0, deflection_per_length.size)
     line_coordinates = np.zeros((2, x.size, 3), dtype=np.float32)
     line_coordinates[:, :, 0] = x
-    line_coordinates[0, :, 1] = ENLARGEMENT * angle_rad * x
-    line_coordinates[1, :, 1] = ENLARGEMENT * (angle_rad * x + deflection_per_length)
+    line_coordinates[0, :, 1] = DRAWING_ENLARGEMENT * angle_rad * x
+    line_coordinates[1, :, 1] = DRAWING_ENLARGEMENT * (angle_rad * x + deflection_per_length)
     return line_coordinates
 
 
-def unscaled_lines(angle_rad: float, deflection_per_length: RealArray) -> npt.NDArray[np.float32]:
+def lines_to_scale(angle_rad: float, deflection_per_length: RealArray) -> npt.NDArray[np.float32]:
     """Return the coordinates of the undeformed and of the bent beam, true to scale.
 
     Arguments and result are those of `enlarged_lines`.
     """
-    along_beam = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
-    across_beam = np.array([-along_beam[1], along_beam[0], 0.0])
-    straight_line = np.linspace(0.0, 1.0, deflection_per_length.size)[:, None] * along_beam
+    along_beam_direction = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
+    across_beam_direction = np.array([-along_beam_direction[1], along_beam_direction[0], 0.0])
+    straight_line = (
+        np.linspace(0.0, 1.0, deflection_per_length.size)[:, None] * along_beam_direction
+    )
     return np.stack(
-        [straight_line, straight_line + deflection_per_length[:, None] * across_beam]
+        [straight_line, straight_line + deflection_per_length[:, None] * across_beam_direction]
     ).astype(np.float32)
 
 
-def tip_label(tip_m: float, *, to_scale: bool = False) -> str:
+def tip_label(tip_m: float, *, is_to_scale: bool = False) -> str:
     """Return a label such as "tip deflection ± 4.2 mm, drawn × 2".
 
-    The deflection is rounded to 0.1 mm, from 10 mm on to two significant digits. `to_scale` means
-    that the drawing is true to scale.
+    The deflection is rounded to 0.1 mm, from 10 mm on to two significant digits. `is_to_scale`
+    means that the drawing is true to scale.
     """
     tip_mm = 1e3 * tip_m
     mm_text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
     return (
-        f"tip deflection ± {mm_text} mm, drawn {'to scale' if to_scale else f'× {ENLARGEMENT:g}'}"
+        f"tip deflection ± {mm_text} mm, drawn "
+        f"{'to scale' if is_to_scale else f'× {DRAWING_ENLARGEMENT:g}'}"
     )
 
 
 def touch_label(touch: Mapping[str, Any]) -> str:
     """Return the label of a touch in the drawing: its number and its position on the beam in m."""
-    x_m = touch["x_m"]
-    return f"touch {touch['number']}: {with_half_width(x_m['value'], x_m['interval_95'])} m"
+    touch_position = touch["x_m"]
+    return (
+        f"touch {touch['number']}: "
+        f"{with_half_width(touch_position['value'], touch_position['interval_95'])} m"
+    )
 
 
 def _assumed_damping(beam: Beam) -> Damping:
@@ -364,16 +370,16 @@ def _draw_direction(stream: "RecordingStream") -> None:
     import rerun as rr
 
     arc_angles_rad = np.linspace(0.35, 1.05, 15)
-    arc = 0.2 * np.column_stack(
+    arc_points = 0.2 * np.column_stack(
         [np.cos(arc_angles_rad), np.sin(arc_angles_rad), np.zeros(arc_angles_rad.size)]
     )
-    arc_end = arc[-1]
+    arc_end = arc_points[-1]
     tangent, outward_vector = 0.15 * np.array([arc_end[1], -arc_end[0], 0.0]), 0.075 * arc_end
     stream.log(
         f"{ANTENNA_ENTITY}/positive",
         rr.LineStrips3D(
             [
-                arc,
+                arc_points,
                 [arc_end + tangent + outward_vector, arc_end, arc_end + tangent - outward_vector],
             ],
             colors=[GREY],
@@ -396,10 +402,10 @@ def _draw_styles(stream: "RecordingStream") -> None:
         (BEAM_ENTITY, [GREY, SKY_BLUE], [1.0, 2.5]),
         (TRAIL_ENTITY, [_TRAIL_COLOR], [0.6]),
     ):
-        style = rr.LineStrips3D.from_fields(
+        line_style = rr.LineStrips3D.from_fields(
             colors=line_colors, radii=rr.Radius.ui_points(line_widths)
         )
-        stream.log(entity, style, static=True)
+        stream.log(entity, line_style, static=True)
     label_position = [(1.25, 0.0, 0.0)]
     stream.log(
         LABEL_ENTITY,
@@ -415,13 +421,13 @@ def _draw_lines(stream: "RecordingStream", entity: str, timed_lines: Sequence[_T
     import rerun as rr
 
     t_ns = np.array([t_ns for t_ns, _ in timed_lines])
-    strips = np.concatenate([strips for _, strips in timed_lines])
-    lines_per_time = len(strips) // len(timed_lines)
+    line_strips = np.concatenate([line_strips for _, line_strips in timed_lines])
+    lines_per_time = len(line_strips) // len(timed_lines)
     # Built here, because Rerun's own function for columns takes three times as long.
     strip_column = rr.ComponentColumn(
         rr.LineStrips3D.descriptor_strips(),
-        rr.components.LineStrip3DBatch(strips),
-        offsets=np.arange(0, len(strips) + 1, lines_per_time, dtype=np.int32),
+        rr.components.LineStrip3DBatch(line_strips),
+        offsets=np.arange(0, len(line_strips) + 1, lines_per_time, dtype=np.int32),
     )
     time_column = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
     stream.send_columns(entity, [time_column], [strip_column], strict=True)

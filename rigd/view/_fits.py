@@ -17,7 +17,7 @@ from rigd.estimates import Estimate, ReportedMode, modes_from_json, unseen_modes
 from rigd.session import Validity
 from rigd.units import suffix_of, unit_of, with_percentage
 from rigd.view._session_info import escape_markdown
-from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Plot, PlotCurve, Source, Values
+from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Plot, PlotCurve, PlotSource, Values
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 Fit = Mapping[str, Any]
 """Fit of a model to a session's samples, as a JSON object (docs/online_fit.md)."""
 
-TABLE: Final = "/fit_table"
+FIT_TABLE_ENTITY: Final = "/fit_table"
 """Entity path in Rerun of the table with the last fit."""
-_PLOTS_ENTITY: Final = "/fits"
+_FIT_PLOTS_ENTITY: Final = "/fits"
 """Entity path in Rerun of the plots of fitted modes over time."""
-_MAX_FINDINGS: Final = 8
+_MAX_TABLE_FINDINGS: Final = 8
 """Largest number of findings that the table of a fit lists."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Quantity:
+class _PlottedQuantity:
     """Quantity of a mode that is plotted over time: frequency or damping ratio."""
 
     name: str
@@ -47,43 +47,43 @@ class _Quantity:
     """Title of the plot, without the number of the mode."""
     unit: str
     """Unit of the plotted values."""
-    factor: float
+    plot_unit_factor: float
     """Factor from the unit of the JSON document to the plotted unit."""
 
-    def field(self, mode: int) -> str:
+    def field_name(self, mode_number: int) -> str:
         """Return the name of the field that holds this quantity of a mode in `fit_record`."""
-        return f"{self.name}_{mode}"
+        return f"{self.name}_{mode_number}"
 
 
 _QUANTITIES: Final = (
-    _Quantity("damping", "damping_ratio", "percent", "Damping ratio", "%", 100.0),
-    _Quantity("frequency", "frequency_hz", "hz", "Frequency", "Hz", 1.0),
+    _PlottedQuantity("damping", "damping_ratio", "percent", "Damping ratio", "%", 100.0),
+    _PlottedQuantity("frequency", "frequency_hz", "hz", "Frequency", "Hz", 1.0),
 )
 """Quantities that are plotted for each mode: damping ratio and frequency."""
 _TARGET_LOW_INDEX, _TARGET_HIGH_INDEX, _LOW_INDEX, _HIGH_INDEX, _VALUE_INDEX = range(5)
 """Indices of the five values in each field of a fit's record; unknown values are NaN."""
 
 
-def fit_source(mode_count: int, *, with_target_std: bool) -> Source:
+def fit_source(mode_count: int, *, with_target_std: bool) -> PlotSource:
     """Return the plots over time of the fitted damping ratio and frequency of each mode.
 
     With `with_target_std` the limits of a requested precision are plotted too.
     """
-    plots = (
-        _plot(quantity, n, with_target_std=with_target_std)
+    mode_plots = (
+        _mode_plot(quantity, n, with_target_std=with_target_std)
         for n in range(1, mode_count + 1)
         for quantity in _QUANTITIES
     )
-    return Source(_PLOTS_ENTITY, tuple(plots))
+    return PlotSource(_FIT_PLOTS_ENTITY, tuple(mode_plots))
 
 
-def _plot(quantity: _Quantity, mode_number: int, *, with_target_std: bool) -> Plot:
+def _mode_plot(quantity: _PlottedQuantity, mode_number: int, *, with_target_std: bool) -> Plot:
     """Return the plot of a mode's frequency or damping ratio, with its 95 % interval over time."""
-    field_name, unit_symbol = quantity.field(mode_number), quantity.unit
+    field_name, unit_symbol = quantity.field_name(mode_number), quantity.unit
 
-    def values(records: npt.NDArray[Any], value_index: int) -> Values:
-        field_values: Values = records[field_name][:, value_index]
-        return field_values
+    def curve_values(records: npt.NDArray[Any], value_index: int) -> Values:
+        quantity_values: Values = records[field_name][:, value_index]
+        return quantity_values
 
     # Curves with the same name have one entry in the legend.
     target_label, interval_label = (
@@ -91,20 +91,20 @@ def _plot(quantity: _Quantity, mode_number: int, *, with_target_std: bool) -> Pl
         f"95 % interval ({unit_symbol})",
     )
     target_limit_curves = (
-        PlotCurve(target_label, GREY, partial(values, value_index=_TARGET_LOW_INDEX)),
-        PlotCurve(target_label, GREY, partial(values, value_index=_TARGET_HIGH_INDEX)),
+        PlotCurve(target_label, GREY, partial(curve_values, value_index=_TARGET_LOW_INDEX)),
+        PlotCurve(target_label, GREY, partial(curve_values, value_index=_TARGET_HIGH_INDEX)),
     )
     return Plot(
         f"{quantity.name}_{mode_number}_{quantity.suffix}",
         f"{quantity.title} of mode {mode_number} ({unit_symbol})",
         (
             *(target_limit_curves if with_target_std else ()),
-            PlotCurve(interval_label, ORANGE, partial(values, value_index=_LOW_INDEX)),
-            PlotCurve(interval_label, ORANGE, partial(values, value_index=_HIGH_INDEX)),
+            PlotCurve(interval_label, ORANGE, partial(curve_values, value_index=_LOW_INDEX)),
+            PlotCurve(interval_label, ORANGE, partial(curve_values, value_index=_HIGH_INDEX)),
             PlotCurve(
                 f"estimate ({unit_symbol})",
                 SKY_BLUE,
-                partial(values, value_index=_VALUE_INDEX),
+                partial(curve_values, value_index=_VALUE_INDEX),
                 2.5,
             ),
         ),
@@ -123,11 +123,11 @@ def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
     mode_count
         Number of modes in the plots; further modes of the fit are omitted.
     """
-    dtype_fields = [
-        (q.field(n), "<f8", (5,)) for n in range(1, mode_count + 1) for q in _QUANTITIES
+    record_fields = [
+        (q.field_name(n), "<f8", (5,)) for n in range(1, mode_count + 1) for q in _QUANTITIES
     ]
-    fit_values = np.zeros(1, [("t_ns", "<i8"), *dtype_fields])
-    for quantity_name, *_ in dtype_fields:
+    fit_values = np.zeros(1, [("t_ns", "<i8"), *record_fields])
+    for quantity_name, *_ in record_fields:
         fit_values[quantity_name] = np.nan
     if fit is None:
         return fit_values
@@ -146,7 +146,7 @@ def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
             target_half_width = np.nan
             if target_std is not None and estimate.std:
                 target_half_width = target_std * (upper_limit - lower_limit) / (2.0 * estimate.std)
-            field_values = np.array(
+            quantity_values = np.array(
                 [
                     estimate.value - target_half_width,
                     estimate.value + target_half_width,
@@ -155,7 +155,9 @@ def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
                     estimate.value,
                 ]
             )
-            fit_values[quantity.field(mode.number)] = quantity.factor * field_values
+            fit_values[quantity.field_name(mode.number)] = (
+                quantity.plot_unit_factor * quantity_values
+            )
     return fit_values
 
 
@@ -170,7 +172,7 @@ def _target_precisions(fit: Fit) -> list[Mapping[str, Any]]:
 # Table
 
 
-def fit_table(fit: Fit | None) -> str:
+def fit_table_markdown(fit: Fit | None) -> str:
     """Return a fit as Markdown: requested precisions, modes, parameters and findings."""
     if fit is None:
         return "No fit yet."
@@ -215,7 +217,7 @@ def fit_table(fit: Fit | None) -> str:
     if table_rows:
         paragraphs.append(_markdown_table("parameter", "value", table_rows=table_rows))
     paragraphs += [
-        escape_markdown(sentence) for sentence in fit.get("findings", ())[:_MAX_FINDINGS]
+        escape_markdown(sentence) for sentence in fit.get("findings", ())[:_MAX_TABLE_FINDINGS]
     ]
     return "\n\n".join(paragraphs)
 
@@ -264,12 +266,16 @@ def _parameter_row(parameter_name: str, estimate: Estimate) -> tuple[str, ...]:
     """Return the table row of a fitted parameter: its name, and its value with interval."""
     interval_95 = estimate.interval_95
     # Small numbers, such as zeta, have a power of ten, the same for value and interval.
-    magnitude = (
+    largest_magnitude = (
         abs(estimate.value)
         if interval_95 is None
         else max(abs(estimate.value), (interval_95[1] - interval_95[0]) / 2.0)
     )
-    power_of_ten = 0 if magnitude == 0 or magnitude >= 1e-2 else int(np.floor(np.log10(magnitude)))
+    power_of_ten = (
+        0
+        if largest_magnitude == 0 or largest_magnitude >= 1e-2
+        else int(np.floor(np.log10(largest_magnitude)))
+    )
     value_text = estimate.text(10.0**-power_of_ten)
     if power_of_ten:
         value_text = f"({value_text})·10{str(power_of_ten).translate(_SUPERSCRIPTS)}"
@@ -293,4 +299,6 @@ def send_table(stream: "RecordingStream", fit: Fit | None) -> None:
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=0.0 if fit is None else fit["duration_s"])
-    stream.log(TABLE, rr.TextDocument(fit_table(fit), media_type=rr.MediaType.MARKDOWN))
+    stream.log(
+        FIT_TABLE_ENTITY, rr.TextDocument(fit_table_markdown(fit), media_type=rr.MediaType.MARKDOWN)
+    )

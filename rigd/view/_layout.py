@@ -3,9 +3,10 @@
 Rerun's plots have no axis titles: the title of the view and the legend state the unit.
 
 Rerun fits an axis to its values, and labels multiples of a power of ten that are far enough apart.
-So ±0.06 would have a single label, 0. In such a case `Scale` adds the next multiple to the values
-as an invisible point, which extends the axis a little. The point has the time of an extreme value
-and leaves the plot with it. Invisible points also extend an axis to the minimum length of its plot.
+So ±0.06 would have a single label, 0. In such a case `AxisTickPoints` adds the next multiple to the
+values as an invisible point, which extends the axis a little. The point has the time of an extreme
+value and leaves the plot with it. Invisible points also extend an axis to the minimum length of its
+plot.
 """
 
 import collections
@@ -20,8 +21,7 @@ import numpy.typing as npt
 
 from rigd.view import _antenna as antenna
 from rigd.view import banner, plots
-from rigd.view._fits import TABLE as FIT_TABLE
-from rigd.view._fits import fit_source
+from rigd.view._fits import FIT_TABLE_ENTITY, fit_source
 from rigd.view._session_info import EVENTS_ENTITY, RECENT_EVENTS_ENTITY, SUMMARY_ENTITY
 from rigd.view.frequency_charts import (
     CHART_SIZES,
@@ -32,7 +32,7 @@ from rigd.view.frequency_charts import (
     SPECTROGRAM_ENTITY,
 )
 from rigd.view.frequency_charts import SIZE as SPECTROGRAM_SIZE
-from rigd.view.plots import TIMELINE, Drawing, Plot, Source, Values, send_columns
+from rigd.view.plots import TIMELINE, Drawing, Plot, PlotSource, Values, send_columns
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -40,18 +40,18 @@ if TYPE_CHECKING:
     from rerun.datatypes import EntityPath
 
 
-WINDOW_S = 10.0
+PLOT_WINDOW_S = 10.0
 """Time range before the cursor that most plots show, in seconds.
 
 The viewer's load grows with this range, not with the length of the session."""
 
-CLOSE_UP_S = 2.0
+CLOSE_UP_WINDOW_S = 2.0
 """Time range before the cursor in the tab Signals: short enough to resolve the oscillations."""
 
-HISTORY_S = 60.0
+HISTORY_WINDOW_S = 60.0
 """Time range before the cursor that plots of slow values show: a few values arrive per second."""
 
-WHOLE_SESSION_S = 86_400.0
+WHOLE_SESSION_WINDOW_S = 86_400.0
 """Time range of plots that show the whole session: longer than any session.
 
 Their values arrive at most once per second."""
@@ -67,14 +67,14 @@ class TimeView:
         Source of the plotted values, and the plot to show.
     window_s
         Time range before the cursor that the plot shows.
-    height
+    height_pt
         Height of the vertical axis, in points, in a window of 1280 × 800.
     """
 
-    source: Source
+    source: PlotSource
     plot: Plot
     window_s: float
-    height: float
+    height_pt: float
 
     @property
     def tick_component(self) -> str:
@@ -82,20 +82,20 @@ class TimeView:
         return f"{self.plot.component}_ticks_{self.window_s:g}_s"
 
 
-_OVERVIEW_PLOT_HEIGHT: Final = 228.0
+_OVERVIEW_PLOT_HEIGHT_PT: Final = 228.0
 """Height of each plot in the tab Overview, in points."""
-_THREE_ROW_PLOT_HEIGHT: Final = 189.0
+_THREE_ROW_PLOT_HEIGHT_PT: Final = 189.0
 """Height of each plot in a tab with three rows of plots, in points."""
-_FOUR_ROW_PLOT_HEIGHT: Final = 131.0
+_FOUR_ROW_PLOT_HEIGHT_PT: Final = 131.0
 """Height of each plot in a tab with four rows of plots, in points."""
 
-OVERVIEW_PLOTS: Final = tuple(
-    TimeView(plots.SIGNALS, plot, WINDOW_S, _OVERVIEW_PLOT_HEIGHT)
+OVERVIEW_VIEWS: Final = tuple(
+    TimeView(plots.SIGNALS, plot, PLOT_WINDOW_S, _OVERVIEW_PLOT_HEIGHT_PT)
     for plot in (plots.ANGLE, plots.COUPLING_TORQUE)
 )
 """Plots of the tab Overview."""
-SIGNALS: Final = tuple(
-    TimeView(plots.SIGNALS, plot, CLOSE_UP_S, _THREE_ROW_PLOT_HEIGHT)
+SIGNAL_VIEWS: Final = tuple(
+    TimeView(plots.SIGNALS, plot, CLOSE_UP_WINDOW_S, _THREE_ROW_PLOT_HEIGHT_PT)
     for plot in (
         plots.ANGLE,
         plots.TRACKING_ERROR,
@@ -106,18 +106,18 @@ SIGNALS: Final = tuple(
     )
 )
 """Plots of the tab Signals."""
-HEALTH: Final = (
-    TimeView(plots.SIGNALS, plots.LOOP, WINDOW_S, _FOUR_ROW_PLOT_HEIGHT),
-    TimeView(plots.READINGS, plots.AGES, WINDOW_S, _FOUR_ROW_PLOT_HEIGHT),
+HEALTH_VIEWS: Final = (
+    TimeView(plots.SIGNALS, plots.LOOP, PLOT_WINDOW_S, _FOUR_ROW_PLOT_HEIGHT_PT),
+    TimeView(plots.READINGS, plots.AGES, PLOT_WINDOW_S, _FOUR_ROW_PLOT_HEIGHT_PT),
     *(
-        TimeView(plots.HEALTH, plot, HISTORY_S, _FOUR_ROW_PLOT_HEIGHT)
+        TimeView(plots.HEALTH, plot, HISTORY_WINDOW_S, _FOUR_ROW_PLOT_HEIGHT_PT)
         for plot in plots.HEALTH.plots
     ),
 )
 """Plots of the tab Health."""
 _MIN_PLOTS_FOR_TWO_COLUMNS: Final = 4
 """Least number of plots in the tab Health for which they are arranged in two columns."""
-TIME_VIEWS: Final = (*OVERVIEW_PLOTS, *SIGNALS, *HEALTH)
+TIME_VIEWS: Final = (*OVERVIEW_VIEWS, *SIGNAL_VIEWS, *HEALTH_VIEWS)
 """All plots over time of the window, without those of the tab Fit."""
 
 TAB_TITLES = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
@@ -130,26 +130,28 @@ _FIT_PLOT_MARGIN_PT: Final = 50.0
 """Height that each plot of the tab Fit needs outside its axes, in points."""
 
 
-def fit_views(fit_plots: Source) -> tuple[TimeView, ...]:
+def fit_views(fit_plots: PlotSource) -> tuple[TimeView, ...]:
     """Return the plots of the tab Fit, two for each mode; their height depends on the number."""
     row_count = max(1, len(fit_plots.plots) // 2)
     plot_height_pt = _FIT_TAB_HEIGHT_PT / row_count - _FIT_PLOT_MARGIN_PT
     return tuple(
-        TimeView(fit_plots, plot, WHOLE_SESSION_S, plot_height_pt) for plot in fit_plots.plots
+        TimeView(fit_plots, plot, WHOLE_SESSION_WINDOW_S, plot_height_pt)
+        for plot in fit_plots.plots
     )
 
 
 def blueprint(
     *,
     absent_components: Collection[str] = (),
-    fit_modes: int | None = None,
+    fitted_mode_count: int | None = None,
     with_target_std: bool = False,
 ) -> "rrb.Blueprint":
     """Return the layout of the live window, which follows the newest sample.
 
     Plots of `absent_components` are omitted, because the session has no values for them.
-    `fit_modes` is the number of modes whose fits are plotted over time, if `with_target_std` with
-    the limits of a requested precision; 0 gives only a table of the last fit, None no tab Fit.
+    `fitted_mode_count` is the number of modes whose fits are plotted over time, if
+    `with_target_std` with the limits of a requested precision; 0 gives only a table of the last
+    fit, None no tab Fit.
     """
     import rerun.blueprint as rrb
 
@@ -162,8 +164,8 @@ def blueprint(
         _events_tab(),
     ]
     tab_names = list(TAB_TITLES)
-    if fit_modes is not None:
-        tab_contents.insert(1, _fit_tab(fit_modes, with_target_std=with_target_std))
+    if fitted_mode_count is not None:
+        tab_contents.insert(1, _fit_tab(fitted_mode_count, with_target_std=with_target_std))
         tab_names.insert(1, FIT_TAB_TITLE)
     for tab, name in zip(tab_contents, tab_names, strict=True):
         tab.name = name
@@ -183,7 +185,7 @@ def _overview_tab() -> "rrb.Container":
     return rrb.Vertical(
         rrb.Horizontal(state_view, gauges_view, column_shares=[6, 7]),
         rrb.Horizontal(
-            rrb.Vertical(*map(_plot, OVERVIEW_PLOTS)),
+            rrb.Vertical(*map(_time_series_view, OVERVIEW_VIEWS)),
             rrb.Vertical(
                 chart_view(
                     "Frequency response: magnitude of torque over angle",
@@ -203,7 +205,7 @@ def _signals_tab() -> "rrb.Container":
     """Return the contents of the tab Signals: plots of the samples of the last 2 s."""
     import rerun.blueprint as rrb
 
-    return rrb.Grid(*map(_plot, SIGNALS), grid_columns=2)
+    return rrb.Grid(*map(_time_series_view, SIGNAL_VIEWS), grid_columns=2)
 
 
 def _frequency_response_tab() -> "rrb.Container":
@@ -233,11 +235,11 @@ def _health_tab(absent_components: Collection[str]) -> "rrb.Container":
     import rerun.blueprint as rrb
 
     shown_views = [
-        time_view for time_view in HEALTH if time_view.plot.component not in absent_components
+        time_view for time_view in HEALTH_VIEWS if time_view.plot.component not in absent_components
     ]
     return rrb.Horizontal(
         rrb.Grid(
-            *map(_plot, shown_views),
+            *map(_time_series_view, shown_views),
             grid_columns=1 if len(shown_views) < _MIN_PLOTS_FOR_TWO_COLUMNS else 2,
         ),
         _summary(),
@@ -249,12 +251,15 @@ def _fit_tab(mode_count: int, *, with_target_std: bool) -> "rrb.Container":
     """Return the contents of the tab Fit: modes over time, and the table of the last fit."""
     import rerun.blueprint as rrb
 
-    table_view = rrb.TextDocumentView(name="Fit of the record", origin=FIT_TABLE)
+    table_view = rrb.TextDocumentView(name="Fit of the record", origin=FIT_TABLE_ENTITY)
     if mode_count == 0:
         return rrb.Vertical(table_view)
     return rrb.Horizontal(
         rrb.Grid(
-            *map(_plot, fit_views(fit_source(mode_count, with_target_std=with_target_std))),
+            *map(
+                _time_series_view,
+                fit_views(fit_source(mode_count, with_target_std=with_target_std)),
+            ),
             grid_columns=2,
         ),
         table_view,
@@ -269,7 +274,7 @@ def _events_tab() -> "rrb.Container":
     return rrb.Vertical(_log())
 
 
-def _plot(time_view: TimeView) -> "rrb.TimeSeriesView":
+def _time_series_view(time_view: TimeView) -> "rrb.TimeSeriesView":
     """Return Rerun's view of a plot over time, with the style of each curve."""
     import rerun as rr
     import rerun.blueprint as rrb
@@ -296,7 +301,7 @@ def _plot(time_view: TimeView) -> "rrb.TimeSeriesView":
         )
     start_boundary = (
         rrb.TimeRangeBoundary.absolute(seconds=0.0)
-        if time_view.window_s == WHOLE_SESSION_S
+        if time_view.window_s == WHOLE_SESSION_WINDOW_S
         else rrb.TimeRangeBoundary.cursor_relative(seconds=-time_view.window_s)
     )
     end_boundary = rrb.TimeRangeBoundary.cursor_relative()
@@ -307,7 +312,7 @@ def _plot(time_view: TimeView) -> "rrb.TimeSeriesView":
         overrides=visualizers,
         # A single curve needs no legend. Intervals of fits are wide at first.
         plot_legend=rrb.PlotLegend(
-            corner="RightTop" if time_view.window_s == WHOLE_SESSION_S else "LeftTop",
+            corner="RightTop" if time_view.window_s == WHOLE_SESSION_WINDOW_S else "LeftTop",
             visible=len(plot.curves) > 1,
         ),
         # The default is a minute around the cursor, half of it in the future.
@@ -419,13 +424,13 @@ _CurvePoint = tuple[int, float]
 """Point of a curve: time since the start of the session in ns, and value."""
 
 
-class Scale:
+class AxisTickPoints:
     """Extreme values of a source's plots, from which invisible points for axis labels follow.
 
     Plots of other sources and plots with fixed axes are ignored.
     """
 
-    def __init__(self, source: "Source", views: "Sequence[TimeView]") -> None:
+    def __init__(self, source: "PlotSource", views: "Sequence[TimeView]") -> None:
         self._entity = source.tick_entity
         self._axes = [
             _AxisExtremes(time_view)
@@ -433,7 +438,7 @@ class Scale:
             if time_view.source is source and time_view.plot.span is None
         ]
 
-    def frame(self) -> list[Drawing]:
+    def initial_drawings(self) -> list[Drawing]:
         """Return the function that sends an empty first value of each axis's invisible points.
 
         Without any value Rerun reports an error.
@@ -442,19 +447,21 @@ class Scale:
         start_ns = np.array([0])
         return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=empty_values)]
 
-    def draw(self, t_ns: npt.NDArray[np.int64], plot_values: Mapping[str, Values]) -> list[Drawing]:
+    def tick_drawings(
+        self, t_ns: npt.NDArray[np.int64], plot_values: Mapping[str, Values]
+    ) -> list[Drawing]:
         """Return functions that send the invisible points that the axes need for new values.
 
         `plot_values` has the values of each plot at the times `t_ns` (n,): component name → values
         (n, curves). Values that are not finite are ignored, as in Rerun.
         """
         interval_indices = (t_ns - t_ns[0]) // _EXTREMES_INTERVAL_NS
-        interval_starts = np.append(0, np.flatnonzero(np.diff(interval_indices)) + 1)
-        times_ns = t_ns[np.append(interval_starts[1:], len(t_ns)) - 1].tolist()
+        interval_start_indices = np.append(0, np.flatnonzero(np.diff(interval_indices)) + 1)
+        times_ns = t_ns[np.append(interval_start_indices[1:], len(t_ns)) - 1].tolist()
         least_values, greatest_values = (
             {
                 component_name: extreme_function.reduceat(
-                    component_values.ravel(), interval_starts * component_values.shape[1]
+                    component_values.ravel(), interval_start_indices * component_values.shape[1]
                 ).tolist()
                 for component_name, component_values in plot_values.items()
             }
@@ -512,19 +519,19 @@ class _AxisExtremes:
             return []
         high_ns, greatest_value = self._greatest.add(t_ns, greatest_value)
         low_ns, minus_low = self._least.add(t_ns, -least_value)
-        value_below, value_above = missing_ticks(
-            -minus_low, greatest_value, self.view.height, self.view.plot.min_span
+        value_below, value_above = missing_tick_values(
+            -minus_low, greatest_value, self.view.height_pt, self.view.plot.min_span
         )
         # When either extreme leaves the window, the missing points are computed again.
         first_extreme_ns = min(low_ns, high_ns)
-        new_points = []
+        new_tick_points = []
         if value_above is not None and self._must_send(self._above, value_above, t_ns):
             self._above = first_extreme_ns, value_above
-            new_points.append(self._above)
+            new_tick_points.append(self._above)
         if value_below is not None and self._must_send(self._below, value_below, t_ns):
             self._below = first_extreme_ns, value_below
-            new_points.append(self._below)
-        return new_points
+            new_tick_points.append(self._below)
+        return new_tick_points
 
     def _must_send(self, last_point: _CurvePoint | None, tick_value: float, t_ns: int) -> bool:
         """Return whether an invisible point is new, has changed or is leaving the window."""
@@ -553,7 +560,7 @@ class _RunningMaximum:
         return self._marks[0]
 
 
-def missing_ticks(
+def missing_tick_values(
     lowest_value: float, highest_value: float, height_pt: float, min_span: float = 0.0
 ) -> tuple[float | None, float | None]:
     """Return the values to add to a plot so that its axis has two labels and spans `min_span`.
@@ -582,11 +589,11 @@ def missing_ticks(
                     else (first_multiple, last_multiple + 1)
                 )
             )
-        axis_ends = first_multiple * tick_step, last_multiple * tick_step
-        further_ticks = missing_ticks(*axis_ends, height_pt)
+        widened_axis_ends = first_multiple * tick_step, last_multiple * tick_step
+        widened_axis_ticks = missing_tick_values(*widened_axis_ends, height_pt)
         value_below, value_above = (
-            end if further_tick is None else further_tick
-            for end, further_tick in zip(axis_ends, further_ticks, strict=True)
+            end if widened_axis_tick is None else widened_axis_tick
+            for end, widened_axis_tick in zip(widened_axis_ends, widened_axis_ticks, strict=True)
         )
         return (
             value_below if value_below < lowest_value else None,

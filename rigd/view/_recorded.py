@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 Records = npt.NDArray[Any]
 """Structured array of samples or timings, shape (n,)."""
 
-_BLOCK_S: Final = 1.0
+_DRAWING_BLOCK_S: Final = 1.0
 """Duration of the blocks of samples that are drawn together: the charts are updated as often."""
 _MAX_TICKS_PER_SAMPLE: Final = 10
 """Largest ratio of a record's length in ticks to its number of samples.
@@ -45,7 +45,7 @@ _MAX_TICKS_PER_SAMPLE: Final = 10
 Filling longer gaps would invent data and fill the disk."""
 _TOUCH_DRAWING_DELAY_S: Final = 0.2
 """Delay after a touch until it is drawn, so that the antenna's lines around its time exist."""
-_LAST_UTC_NS: Final = 2**63 - 1
+_MAX_UTC_NS: Final = 2**63 - 1
 """Latest start of a session, in nanoseconds since 1970: the limit of a 64-bit integer."""
 _ATTACHMENTS_WITH_DAMPING: Final = ("specimen.toml", "profile.toml")
 """Attachments of a session file that may state the nominal damping; the first that does is used."""
@@ -65,7 +65,7 @@ def describe_recorded_session(
     if len(sample_ticks) == 0:
         raise SessionError(f"{session.path}: no samples were recorded, so there is nothing to see.")
     first_tick, end_tick = int(sample_ticks[0]), int(sample_ticks[-1]) + 1
-    if session.start_utc_ns > _LAST_UTC_NS:
+    if session.start_utc_ns > _MAX_UTC_NS:
         raise SessionError(
             f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
             "which Rerun cannot show. The writing program must correct it."
@@ -82,7 +82,9 @@ def describe_recorded_session(
     return SessionDescription(
         name=session.metadata.get("id") or session.path.stem,
         rate_hz=_number_in_range(session, "rate_hz", 1.0, 1e5),
-        ticks=max(end_tick, *(segment_end for _, segment_end in session.segments.values()), 0),
+        scheduled_ticks=max(
+            end_tick, *(segment_end for _, segment_end in session.segments.values()), 0
+        ),
         sweep=sweep_ticks({"sweep": (first_tick, end_tick), **session.segments}),
         beam=Beam(
             _number_in_range(session, "beam_length_m", 1e-3, 1e3),
@@ -95,13 +97,13 @@ def describe_recorded_session(
         torque_delay_s=session.number("torque_delay_s", 0.0),
         excitation=session.metadata.get("excitation", ""),
         sweep_hz=linear_sweep_band_hz(session.metadata.get("excitation", ""), session.metadata),
-        back=session.segments.get("back"),
+        return_sweep=session.segments.get("back"),
         specimen=session.metadata.get("specimen", ""),
         limits=_stated_limits(profile_files[-1]),
-        absent=_components_without_values(session, tick_timings),
-        recorded=True,
+        absent_components=_components_without_values(session, tick_timings),
+        is_recorded=True,
         # The file has only the last fit.
-        fit_modes=0 if has_fit else None,
+        fitted_mode_count=0 if has_fit else None,
     )
 
 
@@ -172,53 +174,57 @@ def draw_session(
     description = describe_recorded_session(session, tick_timings, has_fit=fit_document is not None)
     scene = Scene(
         description,
-        lambda: recorded_blueprint(front_tabs, description.absent, fit_modes=description.fit_modes),
+        lambda: recorded_blueprint(
+            front_tabs,
+            description.absent_components,
+            fitted_mode_count=description.fitted_mode_count,
+        ),
     )
     outcome_document = session.outcome or {}
     banner_state = ended(
         outcome_document.get("outcome", "no outcome"), outcome_document.get("reason", "")
     )
-    scene.state(0, replace(banner_state, over=False))
+    scene.state_drawings(0, replace(banner_state, over=False))
     # The viewer shows session time only, not the time of drawing.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.send_recording_start_time_nanos(session.start_utc_ns)
-    for send_drawing in scene.frame():
+    for send_drawing in scene.initial_drawings():
         send_drawing(stream)
-    remaining_touches = _touches(session)
-    for send_drawing in scene.events(
-        sorted(_notes(session, remaining_touches), key=lambda note: note.t_ns)
+    remaining_touches = _touches_in_record(session)
+    for send_drawing in scene.event_drawings(
+        sorted(_session_notes(session, remaining_touches), key=lambda note: note.t_ns)
     ):
         send_drawing(stream)
     recorded_samples = session.samples
     faulty_tick_counts = np.zeros(3, np.int64)
-    drawn_samples, last_tick = 0, -1
-    block_ticks = max(1, round(_BLOCK_S * description.rate_hz))
-    for sample_block, block_timings in _blocks(recorded_samples, tick_timings, block_ticks):
-        drawn_samples += len(sample_block)
+    drawn_sample_count, last_tick = 0, -1
+    block_ticks = max(1, round(_DRAWING_BLOCK_S * description.rate_hz))
+    for sample_block, block_timings in _sample_blocks(recorded_samples, tick_timings, block_ticks):
+        drawn_sample_count += len(sample_block)
         faulty_tick_counts += _count_faulty_ticks(sample_block, last_tick)
         last_tick, t_ns = int(sample_block["tick"][-1]), int(sample_block["t_ns"][-1])
         missed_ticks, late_ticks, lost_ticks = faulty_tick_counts.tolist()
         health = Health(missed_ticks=missed_ticks, late_ticks=late_ticks, lost_ticks=lost_ticks)
         for send_drawing in (
-            *scene.timings(block_timings),
-            *scene.samples(sample_block),
-            *scene.health(t_ns, health),
+            *scene.timing_drawings(block_timings),
+            *scene.sample_drawings(sample_block),
+            *scene.health_drawings(t_ns, health),
         ):
             send_drawing(stream)
-        due_touches = [
+        touches_to_draw = [
             touch
             for touch in remaining_touches
             if _TOUCH_DRAWING_DELAY_S + touch["time_s"]["value"] < 1e-9 * t_ns
         ]
-        for send_drawing in scene.touches(due_touches):
+        for send_drawing in scene.touch_drawings(touches_to_draw):
             send_drawing(stream)
-        remaining_touches = remaining_touches[len(due_touches) :]
-        on_progress(drawn_samples / len(recorded_samples))
+        remaining_touches = remaining_touches[len(touches_to_draw) :]
+        on_progress(drawn_sample_count / len(recorded_samples))
     for send_drawing in (
-        *scene.finish(),
-        *scene.touches(remaining_touches),
-        *(scene.fit(fit_document) if fit_document is not None else ()),
+        *scene.final_drawings(),
+        *scene.touch_drawings(remaining_touches),
+        *(scene.fit_drawings(fit_document) if fit_document is not None else ()),
     ):
         send_drawing(stream)
 
@@ -226,7 +232,7 @@ def draw_session(
 def recorded_blueprint(
     front_tabs: "Sequence[rrb.Container]" = (),
     absent_components: Collection[str] = (),
-    fit_modes: int | None = None,
+    fitted_mode_count: int | None = None,
 ) -> "rrb.Blueprint":
     """Return the window's layout for a recorded session: that of the live view, playing from 0 s.
 
@@ -234,7 +240,9 @@ def recorded_blueprint(
     """
     import rerun.blueprint as rrb
 
-    live_layout = blueprint(absent_components=absent_components, fit_modes=fit_modes)
+    live_layout = blueprint(
+        absent_components=absent_components, fitted_mode_count=fitted_mode_count
+    )
     return rrb.Blueprint(
         rrb.Tabs(*front_tabs, *live_layout.root_container.contents),
         rrb.TimePanel(timeline=TIMELINE, play_state="playing", state="collapsed"),
@@ -257,7 +265,9 @@ def _number_in_range(
     return stated_number
 
 
-def _notes(session: Session, touch_documents: Sequence[Mapping[str, Any]]) -> Iterator[Note]:
+def _session_notes(
+    session: Session, touch_documents: Sequence[Mapping[str, Any]]
+) -> Iterator[Note]:
     """Yield the notes for the log of the window: events, touches and outcome of a session."""
     for session_event in session.events:
         yield Note(session_event.t_ns, session_event.level, session_event.message)
@@ -269,7 +279,7 @@ def _notes(session: Session, touch_documents: Sequence[Mapping[str, Any]]) -> It
         yield outcome_note(int(session.samples["t_ns"][-1]), outcome_name, outcome_reason)
 
 
-def _touches(session: Session) -> list[dict[str, Any]]:
+def _touches_in_record(session: Session) -> list[dict[str, Any]]:
     """Return the touches whose estimated time is within the record, in order of time."""
     record_end_s = 1e-9 * int(session.samples["t_ns"][-1])
     touches_with_time = [
@@ -290,7 +300,7 @@ def _count_faulty_ticks(samples: Records, last_tick: int) -> npt.NDArray[np.int6
     return np.array([(gap_ticks - lost_ticks).sum(), is_late.sum(), lost_ticks.sum()], np.int64)
 
 
-def _blocks(
+def _sample_blocks(
     samples: Records, tick_timings: Records, block_ticks: int
 ) -> Iterator[tuple[Records, Records]]:
     """Yield samples in blocks of `block_ticks` ticks, each with the timings of the same ticks."""
@@ -298,7 +308,7 @@ def _blocks(
     block_ends = np.append(block_starts, len(samples))
     last_ticks = samples["tick"][block_ends - 1]
     timing_ends = np.searchsorted(tick_timings["tick"], last_ticks, side="right")
-    first_sample = first_timing = 0
+    first_sample_index = first_timing_index = 0
     for end, timing_end in zip(block_ends, timing_ends, strict=True):
-        yield samples[first_sample:end], tick_timings[first_timing:timing_end]
-        first_sample, first_timing = end, timing_end
+        yield samples[first_sample_index:end], tick_timings[first_timing_index:timing_end]
+        first_sample_index, first_timing_index = end, timing_end

@@ -14,7 +14,7 @@ from rigd.sweep_response import HIGHEST_SHOWN_HZ, SweepResponse
 from rigd.view import banner
 from rigd.view._antenna import Antenna
 from rigd.view._fits import fit_record, fit_source, send_table
-from rigd.view._layout import TIME_VIEWS, Scale, blueprint, fit_views
+from rigd.view._layout import TIME_VIEWS, AxisTickPoints, blueprint, fit_views
 from rigd.view._session_info import (
     Health,
     Note,
@@ -30,7 +30,7 @@ from rigd.view.frequency_charts import (
     ResponseCharts,
     SpectrogramChart,
 )
-from rigd.view.plots import HEALTH, READINGS, SIGNALS, Drawing, Source, send_columns
+from rigd.view.plots import HEALTH, READINGS, SIGNALS, Drawing, PlotSource, send_columns
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 Records = npt.NDArray[Any]
 """Structured array of samples, timings or other records of a session, shape (n,)."""
 
-_MIN_BLOCK_S: Final = 0.1
+_MIN_BUFFERED_BLOCK_S: Final = 0.1
 """Least duration of a block of records that is drawn at once.
 
 The computation time for a block hardly depends on its size, so few large blocks are cheaper."""
@@ -77,17 +77,17 @@ class Scene:
         with_target_std = session.excitation == "until"
         self._layout = make_layout or partial(
             blueprint,
-            absent_components=session.absent,
-            fit_modes=session.fit_modes,
+            absent_components=session.absent_components,
+            fitted_mode_count=session.fitted_mode_count,
             with_target_std=with_target_std,
         )
-        last_hz = min(HIGHEST_SHOWN_HZ, session.rate_hz / 2)
+        highest_response_hz = min(HIGHEST_SHOWN_HZ, session.rate_hz / 2)
         self._antenna = Antenna(session)
-        self._response = SweepResponse(session.sweep, session.rate_hz, last_hz)
+        self._response = SweepResponse(session.sweep, session.rate_hz, highest_response_hz)
         self.response_charts = ResponseCharts(session, last_response)
         self._response_is_final = False
         self._spectrogram = RunningSpectrogram(
-            session.rate_hz, step_s=_SPECTROGRAM_STEP_S, last_hz=last_hz
+            session.rate_hz, step_s=_SPECTROGRAM_STEP_S, last_hz=highest_response_hz
         )
         self._spectrogram_chart = SpectrogramChart(
             session, self._spectrogram.frequency_hz, _SPECTROGRAM_STEP_S
@@ -95,22 +95,24 @@ class Scene:
         self._columns: list[tuple[float, npt.NDArray[Any]]] = []
         self._notes: collections.deque[Note] = collections.deque(maxlen=_MAX_STORED_NOTES)
         self._touches: dict[int, list[Drawing]] = {}
-        self._charts_due = _PeriodicTimer(_CHART_UPDATE_PERIOD_S)
+        self._charts_due = _SessionTimer(_CHART_UPDATE_PERIOD_S)
         self._samples = _BlockBuffer(session.rate_hz)
         self._timings = _BlockBuffer(session.rate_hz)
-        self._scales = {
-            record_source: Scale(record_source, TIME_VIEWS)
+        self._axis_tick_points = {
+            record_source: AxisTickPoints(record_source, TIME_VIEWS)
             for record_source in (SIGNALS, READINGS, HEALTH)
         }
         # An empty record first: a view reports missing components as errors.
-        self._fits = [fit_record(None, session.fit_modes or 0)]
+        self._fits = [fit_record(None, session.fitted_mode_count or 0)]
         self._fit: Mapping[str, Any] | None = None
-        self._fit_source: Source | None = None
-        if session.fit_modes:
+        self._fit_source: PlotSource | None = None
+        if session.fitted_mode_count:
             record_source = self._fit_source = fit_source(
-                session.fit_modes, with_target_std=with_target_std
+                session.fitted_mode_count, with_target_std=with_target_std
             )
-            self._scales[record_source] = Scale(record_source, fit_views(record_source))
+            self._axis_tick_points[record_source] = AxisTickPoints(
+                record_source, fit_views(record_source)
+            )
         self._gauges = Gauges(session.rate_hz, session.limits, session.thermal_time_constant_s)
         self._peaks: dict[str, Gauge] = {}
         self._peaks_are_drawn = False
@@ -122,18 +124,22 @@ class Scene:
         """Frequency response of this session so far, for comparison with a later one, or None."""
         return self.response_charts.as_last_response(self._session)
 
-    def frame(self) -> list[Drawing]:
+    def initial_drawings(self) -> list[Drawing]:
         """Return functions that draw the whole window for a newly connected viewer."""
         session_name = self._session.name
         return [
             lambda stream: stream.send_recording_name(session_name),
             lambda stream: stream.send_blueprint(self._layout()),
-            *(drawing for axis_scale in self._scales.values() for drawing in axis_scale.frame()),
+            *(
+                drawing
+                for tick_points in self._axis_tick_points.values()
+                for drawing in tick_points.initial_drawings()
+            ),
             self.response_charts.draw_frames,
             self.response_charts.draw,
             self._spectrogram_chart.draw_frame,
             self._spectrogram_chart.draw,
-            *self._antenna.frame(),
+            *self._antenna.initial_drawings(),
             *(drawing for drawings in self._touches.values() for drawing in drawings),
             *self._draw_fits(np.concatenate(self._fits)),
             *(partial(send_note, note=note) for note in self._notes),
@@ -141,18 +147,18 @@ class Scene:
             *self._draw_banner(),
         ]
 
-    def samples(self, samples: Records) -> list[Drawing]:
+    def sample_drawings(self, samples: Records) -> list[Drawing]:
         """Return functions that draw new samples (n,) of ``SAMPLE_DTYPE`` in all views.
 
         The samples are in order of time, and may have gaps.
         """
         return self._draw_samples(self._samples.add(samples))
 
-    def timings(self, tick_timings: Records) -> list[Drawing]:
+    def timing_drawings(self, tick_timings: Records) -> list[Drawing]:
         """Return functions that plot the ages of the devices' readings (n,) of ``TIMING_DTYPE``."""
         return self._draw_timings(self._timings.add(tick_timings))
 
-    def events(self, session_notes: Sequence[Note]) -> list[Drawing]:
+    def event_drawings(self, session_notes: Sequence[Note]) -> list[Drawing]:
         """Return functions that add events to the log in the window."""
         if not session_notes:
             return []
@@ -162,13 +168,13 @@ class Scene:
             self._draw_recent_events(max(self._t_ns, session_notes[-1].t_ns)),
         ]
 
-    def touches(self, touch_documents: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def touch_drawings(self, touch_documents: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Return functions that draw estimated touches of the beam, given as JSON objects.
 
         An estimate replaces an earlier one of the touch with the same number.
         """
         drawings_of_touches = {
-            touch_document["number"]: self._antenna.touch(touch_document)
+            touch_document["number"]: self._antenna.touch_drawings(touch_document)
             for touch_document in touch_documents
         }
         self._touches |= drawings_of_touches
@@ -176,13 +182,13 @@ class Scene:
             touch_drawing for drawings in drawings_of_touches.values() for touch_drawing in drawings
         ]
 
-    def fit(self, fit_document: Mapping[str, Any]) -> list[Drawing]:
+    def fit_drawings(self, fit_document: Mapping[str, Any]) -> list[Drawing]:
         """Return functions that draw a fit of the record so far, given as a JSON object."""
         self._fit = fit_document
-        self._fits.append(fit_record(fit_document, self._session.fit_modes or 0))
+        self._fits.append(fit_record(fit_document, self._session.fitted_mode_count or 0))
         return self._draw_fits(self._fits[-1])
 
-    def state(self, t_ns: int, banner_state: BannerState) -> list[Drawing]:
+    def state_drawings(self, t_ns: int, banner_state: BannerState) -> list[Drawing]:
         """Return functions that draw a new state of the session; none if it is unchanged.
 
         Parameters
@@ -197,7 +203,7 @@ class Scene:
         self._state, self._health_ns = banner_state, max(self._health_ns, t_ns)
         return self._draw_banner()
 
-    def health(self, t_ns: int, health_reading: Health) -> list[Drawing]:
+    def health_drawings(self, t_ns: int, health_reading: Health) -> list[Drawing]:
         """Return functions that draw the health of loop, recorder, disk and bus at a time.
 
         Parameters
@@ -209,14 +215,14 @@ class Scene:
         """
         self._health, self._health_ns = health_reading, t_ns
         drawings: list[Drawing] = [
-            *self._plot(HEALTH, health_record(t_ns, health_reading)),
+            *self._plot_records(HEALTH, health_record(t_ns, health_reading)),
             partial(send_summary, session=self._session, t_ns=t_ns, health=health_reading),
             *self._draw_banner(),
         ]
         self._peaks_are_drawn = True
         return drawings
 
-    def finish(self) -> list[Drawing]:
+    def final_drawings(self) -> list[Drawing]:
         """Return functions that draw the samples still in the buffer, and the final charts."""
         return [
             *self._draw_samples(self._samples.take_remaining()),
@@ -226,10 +232,12 @@ class Scene:
 
     def _draw_fits(self, fit_records: Records) -> list[Drawing]:
         """Return functions that plot the fits over time and show the table of the last one."""
-        if self._session.fit_modes is None:
+        if self._session.fitted_mode_count is None:
             return []
         record_source = self._fit_source
-        plot_drawings = [] if record_source is None else self._plot(record_source, fit_records)
+        plot_drawings = (
+            [] if record_source is None else self._plot_records(record_source, fit_records)
+        )
         return [*plot_drawings, partial(send_table, fit=self._fit)]
 
     def _draw_samples(self, samples: Records | None) -> list[Drawing]:
@@ -240,7 +248,7 @@ class Scene:
         self._update_peaks(samples)
         self._response.feed(samples)
         self._columns += self._spectrogram.feed(samples["tick"], samples["coupling_torque_nm"])
-        drawings = [*self._plot(SIGNALS, samples), *self._antenna.samples(samples)]
+        drawings = [*self._plot_records(SIGNALS, samples), *self._antenna.sample_drawings(samples)]
         if self._charts_due(self._t_ns):
             drawings += self._draw_charts()
         return drawings
@@ -281,14 +289,14 @@ class Scene:
 
     def _draw_timings(self, tick_timings: Records | None) -> list[Drawing]:
         """Return functions that plot the ages of readings; none if `tick_timings` is None."""
-        return [] if tick_timings is None else self._plot(READINGS, tick_timings)
+        return [] if tick_timings is None else self._plot_records(READINGS, tick_timings)
 
-    def _plot(self, record_source: Source, records: Records) -> list[Drawing]:
+    def _plot_records(self, record_source: PlotSource, records: Records) -> list[Drawing]:
         """Return functions that plot the records of a source over time."""
         t_ns, plot_values = records["t_ns"].astype(np.int64), record_source.columns(records)
         return [
             partial(send_columns, entity=record_source.entity, t_ns=t_ns, columns=plot_values),
-            *self._scales[record_source].draw(t_ns, plot_values),
+            *self._axis_tick_points[record_source].tick_drawings(t_ns, plot_values),
         ]
 
     def _draw_charts(self) -> list[Drawing]:
@@ -316,7 +324,7 @@ def _gauge_with_larger_value(gauge: Gauge, earlier_gauge: Gauge | None) -> Gauge
     return earlier_gauge if gauge.value is None or earlier_gauge.value > gauge.value else gauge
 
 
-class _PeriodicTimer:
+class _SessionTimer:
     """Timer in session time: a call with the present time in ns returns True once per period."""
 
     def __init__(self, period_s: float) -> None:
@@ -334,7 +342,7 @@ class _BlockBuffer:
     """Buffer that combines small blocks of samples or timings into larger blocks."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._ticks = max(1, round(_MIN_BLOCK_S * rate_hz))
+        self._ticks = max(1, round(_MIN_BUFFERED_BLOCK_S * rate_hz))
         self._parts: list[Records] = []
 
     def add(self, new_records: Records) -> Records | None:

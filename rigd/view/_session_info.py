@@ -27,7 +27,7 @@ _LOG_WIDTH_CHARACTERS: Final = 150
 """Width of the log in characters. Longer lines are wrapped, because the viewer would cut them."""
 _MAX_RECENT_EVENTS: Final = 20
 """Largest number of events in the document with the newest events."""
-_LEVEL_PREFIXES: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal": "⚠ **FATAL** "}
+_PREFIXES_BY_LOG_LEVEL: Final = {"warning": "⚠ ", "error": "⚠ **ERROR** ", "fatal": "⚠ **FATAL** "}
 """Markdown prefixes of events in the document with the newest events, by level."""
 
 
@@ -41,7 +41,7 @@ class SessionDescription:
         Name of the session, which the viewer shows as the recording's name.
     rate_hz
         Scheduled ticks per second.
-    ticks
+    scheduled_ticks
         Scheduled ticks of the whole record.
     sweep
         First tick and end (exclusive) of the sweep; if there are two sweeps, those of the first.
@@ -60,7 +60,7 @@ class SessionDescription:
     sweep_hz
         Frequencies at the start and end of a linear sweep; None if the excitation has no linear
         sweep.
-    back
+    return_sweep
         First tick and end (exclusive) of a second sweep, which returns from the last frequency to
         the first; None if there is no second sweep.
     specimen
@@ -70,19 +70,19 @@ class SessionDescription:
         ticks. A signal that is absent has no limit.
     thermal_time_constant_s
         Time constant of the motor's rms torque.
-    absent
+    absent_components
         Component names of plots for which the session has no values, such as the bus load without a
         bus.
-    recorded
+    is_recorded
         Whether the session is read from a file instead of live.
-    fit_modes
+    fitted_mode_count
         Number of modes whose fits are plotted over time. 0: only a table of the last fit is shown.
         None: the record is not fitted.
     """
 
     name: str
     rate_hz: float
-    ticks: int
+    scheduled_ticks: int
     sweep: tuple[int, int]
     beam: Beam
     damping: Damping | None
@@ -91,13 +91,13 @@ class SessionDescription:
     torque_delay_s: float = 0.0
     excitation: str = ""
     sweep_hz: tuple[float, float] | None = None
-    back: tuple[int, int] | None = None
+    return_sweep: tuple[int, int] | None = None
     specimen: str = ""
     limits: Mapping[str, float] = field(default_factory=dict)
     thermal_time_constant_s: float = 10.0
-    absent: frozenset[str] = frozenset()
-    recorded: bool = False
-    fit_modes: int | None = None
+    absent_components: frozenset[str] = frozenset()
+    is_recorded: bool = False
+    fitted_mode_count: int | None = None
 
     def frequency_hz(self, tick: int) -> float | None:
         """Return the frequency of the sweep at a tick; None if the tick is in no linear sweep.
@@ -109,7 +109,9 @@ class SessionDescription:
         """
         if self.sweep_hz is None:
             return None
-        sweep_segments = {"sweep": self.sweep} | ({} if self.back is None else {"back": self.back})
+        sweep_segments = {"sweep": self.sweep} | (
+            {} if self.return_sweep is None else {"back": self.return_sweep}
+        )
         return sweep_frequency_hz(sweep_segments, self.sweep_hz, tick)
 
 
@@ -162,12 +164,12 @@ def outcome_note(t_ns: int, outcome_name: str, outcome_reason: str) -> Note:
     """
     return Note(
         t_ns,
-        _LEVEL_OF_OUTCOME.get(outcome_name, "warning"),
+        _LOG_LEVELS_BY_OUTCOME.get(outcome_name, "warning"),
         f"Outcome: {outcome_name}. {outcome_reason}".rstrip(),
     )
 
 
-_LEVEL_OF_OUTCOME = {"complete": "info", "fault": "error"}
+_LOG_LEVELS_BY_OUTCOME = {"complete": "info", "fault": "error"}
 """Level of the log line that states an outcome; "warning" for all other outcomes."""
 
 
@@ -211,7 +213,9 @@ class Health:
     rate_hz: float | None = None
 
 
-HEALTH_DTYPE: Final = np.dtype([("t_ns", "<i8")] + [(each.name, "<f8") for each in fields(Health)])
+HEALTH_DTYPE: Final = np.dtype(
+    [("t_ns", "<i8")] + [(health_field.name, "<f8") for health_field in fields(Health)]
+)
 """Data type of a health reading as a record, with its time in ns; unknown values are NaN."""
 
 
@@ -223,7 +227,7 @@ def health_record(t_ns: int, health: Health) -> npt.NDArray[Any]:
     return np.array([(t_ns, *health_values)], HEALTH_DTYPE)
 
 
-_RERUN_LEVELS: Final = {
+_RERUN_LEVELS_BY_LEVEL: Final = {
     "debug": "DEBUG",
     "info": "INFO",
     "warning": "WARN",
@@ -244,7 +248,10 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
         for paragraph in note.message.splitlines()
         for wrapped_line in wrap(paragraph, _LOG_WIDTH_CHARACTERS) or [""]
     )
-    stream.log(EVENTS_ENTITY, rr.TextLog(wrapped_text, level=_RERUN_LEVELS.get(note.level, "INFO")))
+    stream.log(
+        EVENTS_ENTITY,
+        rr.TextLog(wrapped_text, level=_RERUN_LEVELS_BY_LEVEL.get(note.level, "INFO")),
+    )
 
 
 def send_recent_notes(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
@@ -258,7 +265,7 @@ def send_recent_notes(stream: "RecordingStream", t_ns: int, notes: "Sequence[Not
     document_lines = []
     for log_note in reversed(notes[-_MAX_RECENT_EVENTS:]):
         time_s = max(0.0, 1e-9 * log_note.t_ns)  # the first event may come a tick early
-        level_prefix = _LEVEL_PREFIXES.get(log_note.level, "")
+        level_prefix = _PREFIXES_BY_LOG_LEVEL.get(log_note.level, "")
         document_lines.append(
             f"**{time_s:.1f} s** {level_prefix}{escape_markdown(log_note.message)}"
         )
@@ -274,10 +281,10 @@ def escape_markdown(text: str) -> str:
     return escaped_text.replace("\n", "  \n")
 
 
-def summary(session: "SessionDescription", t_ns: int, health: "Health") -> str:
+def summary_table(session: "SessionDescription", t_ns: int, health: "Health") -> str:
     """Return a Markdown table of the session's progress and health, without unknown values."""
     elapsed_s = 1e-9 * t_ns
-    total_s = session.ticks / session.rate_hz
+    scheduled_duration_s = session.scheduled_ticks / session.rate_hz
     table_rows = [
         ("rate", _number_text(health.rate_hz, "{:.1f} Hz"), True),
         ("missed ticks", _number_text(health.missed_ticks), not health.missed_ticks),
@@ -295,7 +302,7 @@ def summary(session: "SessionDescription", t_ns: int, health: "Health") -> str:
         for row_name, value_text, is_normal in table_rows
         if value_text
     ]
-    session_row = f"| session | {elapsed_s:.0f} of {total_s:.0f} s |"
+    session_row = f"| session | {elapsed_s:.0f} of {scheduled_duration_s:.0f} s |"
     return "\n".join([session_row, "|---|---|", *table_lines])
 
 
@@ -306,7 +313,7 @@ def send_summary(
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    summary_text = summary(session, t_ns, health)
+    summary_text = summary_table(session, t_ns, health)
     stream.log(SUMMARY_ENTITY, rr.TextDocument(summary_text, media_type=rr.MediaType.MARKDOWN))
 
 

@@ -124,8 +124,8 @@ def banner(session: "SessionDescription", state: BannerState, t_ns: int, health:
     health
         Health reading at that time.
     """
-    remaining_s = session.ticks / session.rate_hz - 1e-9 * t_ns
-    heading = f"# {'Recorded: ' if session.recorded else ''}{state.word}"
+    remaining_s = session.scheduled_ticks / session.rate_hz - 1e-9 * t_ns
+    heading = f"# {'Recorded: ' if session.is_recorded else ''}{state.word}"
     if state is RUNNING and remaining_s > 0.0:
         heading += f" · {math.ceil(remaining_s)} s left"
     banner_lines = [heading]
@@ -143,7 +143,7 @@ def banner(session: "SessionDescription", state: BannerState, t_ns: int, health:
     excitation_text = f"**{escape_markdown(session.excitation or 'session')}**"
     if session.sweep_hz is not None:
         start_hz, stop_hz = session.sweep_hz
-        back_sweep_text = "" if session.back is None else f" → {start_hz:g}"
+        back_sweep_text = "" if session.return_sweep is None else f" → {start_hz:g}"
         excitation_text += f" {start_hz:g} → {stop_hz:g}{back_sweep_text} Hz"
     sweep_tick = round(1e-9 * t_ns * session.rate_hz)
     if not state.over and (frequency_hz := session.frequency_hz(sweep_tick)) is not None:

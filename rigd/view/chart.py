@@ -131,7 +131,7 @@ class Chart:
     right: float = _RIGHT_MARGIN
 
     @property
-    def frame(self) -> tuple[float, float, float, float]:
+    def frame_edges(self) -> tuple[float, float, float, float]:
         """Left, top, right and bottom of the frame on the canvas.
 
         As in all of Rerun's canvases, the vertical coordinate increases downwards.
@@ -148,7 +148,7 @@ class Chart:
         x, y
             Values on the horizontal and on the vertical axis, shape (n,).
         """
-        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
         x_fraction, y_fraction = np.broadcast_arrays(self.x.fraction(x), self.y.fraction(y))
         return np.stack(
             [
@@ -162,7 +162,7 @@ class Chart:
         """Send the static parts of the chart: frame, grid, tick labels, titles and legend."""
         import rerun as rr
 
-        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
         frame_corners = [
             [frame_left, frame_top],
             [frame_right, frame_top],
@@ -183,7 +183,7 @@ class Chart:
 
     def tick_labels(self) -> list[tuple[str, float, float]]:
         """Return the text of each tick label and the canvas coordinates of its middle."""
-        frame_left, _, _, frame_bottom = self.frame
+        frame_left, _, _, frame_bottom = self.frame_edges
         return [
             (
                 tick_text(tick_value),
@@ -262,7 +262,7 @@ class Chart:
         """
         import rerun as rr
 
-        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
         frame_middle = [(frame_left + frame_right) / 2, (frame_top + frame_bottom) / 2 - LABEL_DROP]
         stream.log(
             f"{self.entity}/note",
@@ -319,7 +319,7 @@ class Chart:
         first_x, last_x
             Values of the horizontal axis at the left and right end of the area.
         """
-        _, frame_top, _, frame_bottom = self.frame
+        _, frame_top, _, frame_bottom = self.frame_edges
         shade_left, shade_right = self.to_canvas([first_x, last_x], self.y.first)[:, 0]
         self._position_shade(stream, shade_name, (shade_left, frame_top, shade_right, frame_bottom))
 
@@ -327,7 +327,7 @@ class Chart:
         """Draw the tick labels, the titles of the axes and the labels of the legend."""
         import rerun as rr
 
-        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
         frame_middle = (frame_left + frame_right) / 2
         placed_labels = [
             *self.tick_labels(),
@@ -360,7 +360,7 @@ class Chart:
         """Draw dotted grid lines, since solid lines are opaque and distract from the curves."""
         import rerun as rr
 
-        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
         vertical_line_x = self.to_canvas([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
         horizontal_line_y = self.to_canvas(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
         dot_positions = [
@@ -431,7 +431,7 @@ class Chart:
 
     def _legend_positions(self) -> list[tuple[LegendEntry, float, float]]:
         """Return the legend's entries with positions (x, y) above the frame, right-aligned."""
-        _, frame_top, right_edge, _ = self.frame
+        _, frame_top, right_edge, _ = self.frame_edges
         placed_entries = []
         x = right_edge
         for key in reversed(self.legend):

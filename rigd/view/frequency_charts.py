@@ -448,7 +448,7 @@ class SpectrogramChart:
     def __init__(
         self, session: "SessionDescription", frequency_hz: RealArray, step_s: float
     ) -> None:
-        duration_s = max(session.ticks / session.rate_hz, step_s)
+        duration_s = max(session.scheduled_ticks / session.rate_hz, step_s)
         self._column_s = max(step_s, duration_s / MAX_COLUMNS)
         column_count = int(np.ceil(duration_s / self._column_s))
         end_s = column_count * self._column_s

@@ -100,7 +100,7 @@ class Plot:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class PlotSource:
     """Group of plots whose values come from the same kind of records.
 
     Attributes
@@ -245,7 +245,7 @@ LOOP = Plot(
     min_span=100.0,
 )
 """Plot of the control loop's wake-up latency and execution time."""
-SIGNALS = Source(
+SIGNALS = PlotSource(
     "/signals",
     (ANGLE, TRACKING_ERROR, COUPLING_TORQUE, TORQUE_COMMAND, FORCES, TORQUES, LOOP),
 )
@@ -261,7 +261,7 @@ AGES = Plot(
     min_span=1.0,
 )
 """Plot of the age of angle and wrench readings."""
-READINGS = Source("/readings", (AGES,))
+READINGS = PlotSource("/readings", (AGES,))
 """Plots of the readings' timings."""
 
 FAULTY_TICKS = Plot(
@@ -318,5 +318,5 @@ BUS_PLOT_COMPONENTS: Final = frozenset(
 """Component names of the plots that have values only with a bus."""
 REAL_TIME_PLOT_COMPONENTS: Final = frozenset(plot.component for plot in (LOOP, AGES))
 """Component names of the plots that have no values with the virtual clock of a simulation."""
-HEALTH = Source("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
+HEALTH = PlotSource("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
 """Plots of the health readings."""

@@ -137,7 +137,7 @@ def test_every_sample_is_shown_in_units_of_the_plots(chirp_recording):
 def test_frequency_response_grows_with_the_sweep(chirp_recording):
     session, found, _ = chirp_recording
     chart = ResponseCharts(describe_recorded_session(session)).chart(MAGNITUDE_ENTITY)
-    left, _, right, _ = chart.frame
+    left, _, right, _ = chart.frame_edges
     first_hz, last_hz = chart.x.first, chart.x.last
     drawn = rows(found[f"{MAGNITUDE_ENTITY}/measured"], "LineStrips2D:strips")
     assert len({t_ns for t_ns, _ in drawn}) > 15  # once a second
@@ -156,7 +156,7 @@ def test_frequency_response_grows_with_the_sweep(chirp_recording):
 def test_last_frequency_response_is_that_of_analyze(chirp_recording):
     session, found, _ = chirp_recording
     chart = ResponseCharts(describe_recorded_session(session)).chart(MAGNITUDE_ENTITY)
-    left, top, right, bottom = chart.frame
+    left, top, right, bottom = chart.frame_edges
     # All of it, coherent or not.
     *_, (_, strips) = rows(found[f"{MAGNITUDE_ENTITY}/uncertain"], "LineStrips2D:strips")
     points = np.concatenate([np.asarray(strip, dtype=np.float64) for strip in strips])
@@ -251,9 +251,9 @@ def test_plot_of_ages_for_a_real_rig(write_session_file):
     samples = session.samples.copy()
     samples["work_ns"] = 1000  # in simulated time there is none
     of_a_rig = replace(session, samples=samples)
-    assert AGES.component not in describe_recorded_session(of_a_rig, timings).absent
+    assert AGES.component not in describe_recorded_session(of_a_rig, timings).absent_components
     for without in (None, timings[:0]):
-        assert AGES.component in describe_recorded_session(of_a_rig, without).absent
+        assert AGES.component in describe_recorded_session(of_a_rig, without).absent_components
 
 
 MINIMAL_METADATA = {

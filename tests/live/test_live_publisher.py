@@ -80,7 +80,7 @@ def test_every_record_arrives_in_units_of_the_plots(received):
 
 @pytest.mark.further  # as in tests/view
 def test_fits_are_in_the_plots_and_events(publisher, save):
-    publisher.show("fitted", fit_modes=2, excitation="until")
+    publisher.show("fitted", fitted_mode_count=2, excitation="until")
     saver = save(publisher.address)
     fits = online_fit(0.4, 2.0), online_fit(0.8)
     for fit in fits:

@@ -18,7 +18,7 @@ from rigd.session.quick_look import (
     quick_look_path,
     read_quick_look,
 )
-from rigd.view._fits import fit_table
+from rigd.view._fits import fit_table_markdown
 
 RESPONSE = {
     "frequency_hz": [1.0, 2.0],
@@ -230,4 +230,4 @@ def test_usable_parts_of_a_fit_are_read():
 def test_invalid_parts_of_a_fit_are_omitted(found):
     for content in (found, online_fit() | found if isinstance(found, dict) else found):
         fit = fit_of({"fit": json.dumps(content)})
-        assert fit is None or fit_table(fit)
+        assert fit is None or fit_table_markdown(fit)

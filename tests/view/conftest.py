@@ -110,7 +110,7 @@ def layout_of(description):
 
     def taken(of=description):
         stream = _LayoutReader()
-        for drawing in Scene(of).frame():
+        for drawing in Scene(of).initial_drawings():
             drawing(stream)
         return stream.layout.root_container
 
@@ -137,7 +137,7 @@ def description():
     return SessionDescription(
         name="20261121-101500-chirp",
         rate_hz=1000.0,
-        ticks=136_000,
+        scheduled_ticks=136_000,
         sweep=(1000, 121_000),
         beam=Beam(0.98, 4.7e-3, 0.090275),
         damping=Damping(7.1e-5, 0.996, 5.5e-2, 0.594),

@@ -45,8 +45,8 @@ def follow(description, drawn):
 
     def run(blocks_of_samples, of=description):
         scene = Scene(of)
-        drawings = [d for block in blocks_of_samples for d in scene.samples(block)]
-        return drawn([*drawings, *scene.finish()])
+        drawings = [d for block in blocks_of_samples for d in scene.sample_drawings(block)]
+        return drawn([*drawings, *scene.final_drawings()])
 
     return run
 
@@ -108,7 +108,7 @@ def test_large_motion_is_drawn_to_scale(description, samples, drawn, excitation)
     turned["angle_rad"] += 1.0
     bends = DeflectionFilter(description.beam, description.damping, description.rate_hz)
     for block in blocks(turned, 100):
-        sent = drawn(scene.samples(block))
+        sent = drawn(scene.sample_drawings(block))
         deflection = bends.feed(block["angle_rad"]) / description.beam.length_m
         line, beam = moments(sent[BEAM])[-1][1]
         angle_rad = block["angle_rad"][-1]
@@ -194,11 +194,11 @@ def test_beam_without_damping_continues_to_swing(description, make_samples, foll
 
 
 def test_no_samples_give_no_drawing(description, make_samples):
-    assert Scene(description).samples(make_samples(0)) == []
+    assert Scene(description).sample_drawings(make_samples(0)) == []
 
 
 def test_frame_draws_the_motor_and_the_shape_of_the_beam(description, drawn):
-    sent = drawn(Scene(description).frame())
+    sent = drawn(Scene(description).initial_drawings())
     assert {f"{ANTENNA}/motor", f"{ANTENNA}/positive", BEAM, TRAIL, LABEL} <= sent.keys()
     # Nothing of it moves, so nothing of it has a time.
     of_antenna = [b for entity in sent if entity.startswith(ANTENNA) for b in sent[entity]]
@@ -239,8 +239,8 @@ def values_of(batches, component):
 def test_touch_is_drawn_at_the_beam_against_its_motion(description, samples, drawn):
     scene = Scene(description)
     for block in blocks(samples, 100):
-        scene.samples(block)
-    sent = drawn(scene.touches([TOUCH_AT_2_S]))
+        scene.sample_drawings(block)
+    sent = drawn(scene.touch_drawings([TOUCH_AT_2_S]))
     times, (point,) = values_of(sent[f"{TOUCH}/3/point"], "Points3D:positions")
     assert times == [2_012_300_000]
     # The exact shape of that very tick.
@@ -271,10 +271,10 @@ def test_touch_is_drawn_at_the_beam_against_its_motion(description, samples, dra
 )
 def test_touch_of_unknown_position_or_time_is_not_drawn(description, samples, changes):
     scene = Scene(description)
-    scene.samples(samples)
-    assert scene.touches([TOUCH_AT_2_S | changes]) == []
-    assert scene.touches([TOUCH_AT_2_S])
+    scene.sample_drawings(samples)
+    assert scene.touch_drawings([TOUCH_AT_2_S | changes]) == []
+    assert scene.touch_drawings([TOUCH_AT_2_S])
 
 
 def test_touch_before_the_first_shape_is_not_drawn(description):
-    assert Scene(description).touches([TOUCH_AT_2_S]) == []
+    assert Scene(description).touch_drawings([TOUCH_AT_2_S]) == []

@@ -73,7 +73,7 @@ def test_every_state_shows_its_name_and_reason(sweep, state, heading):
 
 
 def test_recorded_session_is_not_shown_as_running(sweep):
-    text = banner(replace(sweep, recorded=True), FAULT, 0, Health())
+    text = banner(replace(sweep, is_recorded=True), FAULT, 0, Health())
     assert text.startswith("# Recorded: FAULT")
 
 
@@ -87,7 +87,9 @@ def test_only_a_linear_sweep_has_a_frequency(description, sweep):
 
 
 def test_a_sweep_there_and_back_has_a_frequency_on_both_ways(sweep):
-    both = replace(sweep, sweep_hz=(0.0, 50.0), back=(121_000, 241_000), ticks=256_000)
+    both = replace(
+        sweep, sweep_hz=(0.0, 50.0), return_sweep=(121_000, 241_000), scheduled_ticks=256_000
+    )
     frequencies = [both.frequency_hz(tick) for tick in (61_000, 121_000, 181_000, 241_000)]
     assert frequencies == [25.0, 50.0, 25.0, None]
     text = banner(both, RUNNING, 181_000_000_000, Health())
@@ -119,12 +121,12 @@ def test_gauge_is_shown_to_a_thousandth_of_its_limit(gauge, text):
 @pytest.mark.process
 def test_state_and_values_are_drawn_on_arrival(sweep, make_samples, shown):
     scene = Scene(sweep)
-    drawings = scene.frame()
-    drawings += scene.state(0, RUNNING)
-    assert scene.state(0, RUNNING) == []
-    drawings += scene.samples(make_samples(1000, angle_rad=0.9))
-    drawings += scene.health(1_000_000_000, Health(missed_ticks=0))
-    drawings += scene.state(1_000_000_000, FAULT)
+    drawings = scene.initial_drawings()
+    drawings += scene.state_drawings(0, RUNNING)
+    assert scene.state_drawings(0, RUNNING) == []
+    drawings += scene.sample_drawings(make_samples(1000, angle_rad=0.9))
+    drawings += scene.health_drawings(1_000_000_000, Health(missed_ticks=0))
+    drawings += scene.state_drawings(1_000_000_000, FAULT)
     found = shown(drawings)
     words = [text.split("\n")[0] for (text,) in found[STATE_ENTITY].values["TextDocument:text"]]
     assert words == ["# PREPARING", "# RUNNING · 136 s left", "# RUNNING · 135 s left", "# FAULT"]
@@ -141,8 +143,8 @@ def test_a_peak_between_two_drawings_is_not_lost(sweep, make_samples, shown):
     samples = make_samples(1000)
     samples["angle_rad"][50] = 0.5
     for i in range(0, 1000, 100):
-        scene.samples(samples[i : i + 100])
-    found = shown(scene.health(1_000_000_000, Health()))
+        scene.sample_drawings(samples[i : i + 100])
+    found = shown(scene.health_drawings(1_000_000_000, Health()))
     assert "angle 0.500 of 1 rad" in found[f"{GAUGES_ENTITY}/texts"].values["Points2D:labels"][-1]
 
 
@@ -151,7 +153,9 @@ def test_events_are_shown_in_full_the_newest_first(sweep, shown):
     scene = Scene(sweep)
     long = "The *torque* command " + 40 * "is above its warning level " + "now."
     found = shown(
-        scene.events([Note(0, "info", "Record starts."), Note(2_500_000_000, "warning", long)])
+        scene.event_drawings(
+            [Note(0, "info", "Record starts."), Note(2_500_000_000, "warning", long)]
+        )
     )
     newest, first = found["/recent_events"].last("TextDocument:text").split("\n\n")
     assert newest.startswith("**2.5 s** ⚠ The \\*torque\\* command is above")

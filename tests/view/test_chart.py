@@ -38,7 +38,7 @@ def axes(logarithmic: bool):
 )
 def test_tick_labels_are_at_their_values(x, y, width, height):
     chart = Chart("/chart", width, height, x, y)
-    left, top, right, bottom = chart.frame
+    left, top, right, bottom = chart.frame_edges
     labels = chart.tick_labels()
     assert len(labels) == len(x.ticks) + len(y.ticks)
     for text, across, down in labels[: len(x.ticks)]:
@@ -61,7 +61,7 @@ def test_equal_ratios_have_equal_lengths(axis, fractions):
 
 def test_vertical_axis_points_upwards():
     chart = Chart("/c", 800.0, 400.0, Axis("", 0.0, 10.0, ()), Axis("", -1.0, 1.0, ()))
-    left, top, right, bottom = chart.frame
+    left, top, right, bottom = chart.frame_edges
     assert chart.to_canvas([0.0, 10.0, 5.0], [-1.0, 1.0, 0.0]) == pytest.approx(
         np.array([[left, bottom], [right, top], [(left + right) / 2, (top + bottom) / 2]])
     )
@@ -84,7 +84,7 @@ def test_curves_are_at_their_stated_positions(shown):
     axis = Axis("Frequency (Hz)", 1.0, 100.0, (1.0, 10.0, 100.0), logarithmic=True)
     key = LegendEntry("measured", SKY_BLUE, width=3.0)
     chart = Chart("/c", 800.0, 400.0, axis, Axis("Level (dB)", 0.0, 1.0, (0.0, 1.0)), (key,))
-    left, top, right, bottom = chart.frame
+    left, top, right, bottom = chart.frame_edges
     curve = np.array([[1.0, 0.0], [10.0, 1.0], [100.0, 0.5]])
     found = shown(
         [

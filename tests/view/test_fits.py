@@ -12,13 +12,13 @@ from rigd.view import Scene, draw_session
 
 pytestmark = pytest.mark.process
 
-TABLE = "/fit_table"
+FIT_TABLE_ENTITY = "/fit_table"
 
 
 @pytest.fixture
 def fitted(description):
     """The paper's session as a search, of which the fits of so many modes are plotted."""
-    return lambda modes=3: replace(description, fit_modes=modes, excitation="until")
+    return lambda modes=3: replace(description, fitted_mode_count=modes, excitation="until")
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def curves(fitted, shown):
 
     def last(fit, modes=3):
         scene = Scene(fitted(modes))
-        found = shown(scene.frame() if fit is None else scene.fit(fit))["/fits"]
+        found = shown(scene.initial_drawings() if fit is None else scene.fit_drawings(fit))["/fits"]
         return {name: values[-1] for name, values in found.values.items()}
 
     return last
@@ -36,7 +36,9 @@ def curves(fitted, shown):
 @pytest.fixture
 def fit_table(fitted, shown):
     """Return the text of the table of a fit."""
-    return lambda fit: shown(Scene(fitted()).fit(fit))[TABLE].last("TextDocument:text")
+    return lambda fit: shown(Scene(fitted()).fit_drawings(fit))[FIT_TABLE_ENTITY].last(
+        "TextDocument:text"
+    )
 
 
 def test_plot_has_estimate_interval_and_target(curves):
@@ -67,7 +69,7 @@ def test_unknown_values_are_not_plotted(curves, fit, component):
 
 def test_plot_without_a_target_has_estimate_and_interval(fitted, shown):
     scene = Scene(replace(fitted(2), excitation="chirp"))
-    found = shown(scene.fit(online_fit()))["/fits"]
+    found = shown(scene.fit_drawings(online_fit()))["/fits"]
     assert len(found.values) == 4
     assert all(len(values[-1]) == 3 for values in found.values.values())
 
@@ -99,28 +101,31 @@ def test_table_shows_progress_and_remaining_time(fit_table):
 
 def test_fitted_sessions_have_two_plots_per_mode(description, layout_of):
     first, *others = [tab.name for tab in layout_of().contents]
-    layout = layout_of(replace(description, fit_modes=2))
+    layout = layout_of(replace(description, fitted_mode_count=2))
     assert [tab.name for tab in layout.contents] == [first, "Fit", *others]
     grid, table = layout.contents[1].contents
     assert [view.name for view in grid.contents] == [
         "Damping ratio of mode 1 (%)", "Frequency of mode 1 (Hz)",
         "Damping ratio of mode 2 (%)", "Frequency of mode 2 (Hz)",
     ]  # fmt: skip
-    assert table.origin == TABLE
-    (only,) = layout_of(replace(description, fit_modes=0)).contents[1].contents
-    assert only.origin == TABLE
+    assert table.origin == FIT_TABLE_ENTITY
+    (only,) = layout_of(replace(description, fitted_mode_count=0)).contents[1].contents
+    assert only.origin == FIT_TABLE_ENTITY
 
 
 def test_new_connections_get_all_fits(fitted, shown):
     picture = Scene(fitted(2))
-    assert shown(picture.frame())[TABLE].last("TextDocument:text") == "No fit yet."
-    picture.fit(online_fit(6.0, 2.0))
-    drawn = picture.fit(online_fit(8.0))
-    for drawings in (drawn, picture.frame()):
+    assert (
+        shown(picture.initial_drawings())[FIT_TABLE_ENTITY].last("TextDocument:text")
+        == "No fit yet."
+    )
+    picture.fit_drawings(online_fit(6.0, 2.0))
+    drawn = picture.fit_drawings(online_fit(8.0))
+    for drawings in (drawn, picture.initial_drawings()):
         found = shown(drawings)
         assert found["/fits"].times_ns["damping_2_percent"][-1] == 8_000_000_000
         assert found["/fits"].values["damping_2_percent"][-1][-1] == pytest.approx(0.416)
-        assert "Fit of the first 8.0 s" in found[TABLE].last("TextDocument:text")
+        assert "Fit of the first 8.0 s" in found[FIT_TABLE_ENTITY].last("TextDocument:text")
     low, high = (np.array(found["/fits"].values["damping_2_percent"])[:, k] for k in (2, 3))
     # From nothing known over a wide interval to a narrow one.
     assert np.isnan(low[0])
@@ -129,17 +134,17 @@ def test_new_connections_get_all_fits(fitted, shown):
 
 def test_session_without_fits_draws_none(description, shown):
     picture = Scene(description)
-    assert picture.fit(online_fit()) == []
-    assert TABLE not in shown(picture.frame())
+    assert picture.fit_drawings(online_fit()) == []
+    assert FIT_TABLE_ENTITY not in shown(picture.initial_drawings())
 
 
 @pytest.mark.further  # as one that runs
 def test_a_recorded_session_shows_the_fit_in_its_file(touch_file, shown, make_timings):
     timings = make_timings(0)
     recorded = read_session(touch_file.path)
-    assert TABLE not in shown([lambda stream: draw_session(stream, recorded, timings)])
+    assert FIT_TABLE_ENTITY not in shown([lambda stream: draw_session(stream, recorded, timings)])
     fit = online_fit(1.5) | {"search": {"reason": "Reached.", "pieces": []}}
     session = replace(recorded, outcome={"fit": json.dumps(fit)})
     found = shown([lambda stream: draw_session(stream, session, timings)])
-    assert found[TABLE].last("TextDocument:text").startswith("**Reached.**")
+    assert found[FIT_TABLE_ENTITY].last("TextDocument:text").startswith("**Reached.**")
     assert "/fits" not in found

@@ -86,7 +86,7 @@ def test_tick_values_are_sent_but_invisible(time_series, description, shown):
     # A view reports entities that it never got.
     sent = {
         (entity, name)
-        for entity, found in shown(Scene(description).frame()).items()
+        for entity, found in shown(Scene(description).initial_drawings()).items()
         for name in found.values
         if entity.endswith("/ticks")
     }
@@ -109,7 +109,7 @@ def test_plots_without_data_are_left_out(description, layout_of):
     absent = plots.BUS_PLOT_COMPONENTS | plots.REAL_TIME_PLOT_COMPONENTS
     health = {
         view.name
-        for tab in layout_of(replace(description, absent=absent)).contents
+        for tab in layout_of(replace(description, absent_components=absent)).contents
         if tab.name == "Health"
         for view in leaves(tab)
     }

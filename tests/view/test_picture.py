@@ -36,7 +36,7 @@ def description_of(record) -> SessionDescription:
     return SessionDescription(
         name=record.path.stem,
         rate_hz=record.rate_hz,
-        ticks=len(record.time_s),
+        scheduled_ticks=len(record.time_s),
         sweep=(record.sweep.start, record.sweep.stop),
         beam=record.beam,
         damping=Damping(7.1e-5, 0.996, 5.5e-2, 0.594),
@@ -54,8 +54,8 @@ def blocks(samples, size=50):
 def test_final_response_is_that_of_the_analyser(path, record, shown):
     picture = Scene(description_of(record))
     for block in blocks(read_session(path).samples):
-        picture.samples(block)
-    drawings = picture.finish()
+        picture.sample_drawings(block)
+    drawings = picture.final_drawings()
     found = shown(drawings)
     # All of it is below the coherent values.
     (strip,) = found[f"{MAGNITUDE_ENTITY}/uncertain"].values["LineStrips2D:strips"][-1]
@@ -67,7 +67,7 @@ def test_final_response_is_that_of_the_analyser(path, record, shown):
     inside = (points[:, 0] > at[0, 0]) & (points[:, 0] < at[-1, 0])
     assert 300 < inside.sum() <= 400
     nearest = abs(at[:, 0] - points[inside, :1]).argmin(axis=1)
-    _, top, _, bottom = chart.frame
+    _, top, _, bottom = chart.frame_edges
     decibels = (chart.y.last - chart.y.first) / (bottom - top)
     one_percent_db = 20 * np.log10(1.01)
     assert np.all(abs(at[nearest, 1] - points[inside, 1]) * decibels < one_percent_db)
@@ -78,17 +78,17 @@ def test_final_response_is_that_of_the_analyser(path, record, shown):
 
 def test_all_entities_are_in_the_layout(description, make_samples, make_timings, shown):
     picture = Scene(description)
-    frame = picture.frame()
+    frame = picture.initial_drawings()
     t_s = np.arange(3000) / 1000.0
     samples = make_samples(3000, angle_rad=0.01 * np.sin(t_s), coupling_torque_nm=0.1)
     timings = make_timings(3000)
     drawings = list(frame)
     for i in range(0, 3000, 50):
-        drawings += picture.samples(samples[i : i + 50])
-        drawings += picture.timings(timings[i : i + 50])
-    drawings += picture.health(3_000_000_000, Health(missed_ticks=1, rate_hz=1000.0))
-    drawings += picture.events([Note(1_000_000, "warning", "1 tick was missed.")])
-    drawings += picture.finish()
+        drawings += picture.sample_drawings(samples[i : i + 50])
+        drawings += picture.timing_drawings(timings[i : i + 50])
+    drawings += picture.health_drawings(3_000_000_000, Health(missed_ticks=1, rate_hz=1000.0))
+    drawings += picture.event_drawings([Note(1_000_000, "warning", "1 tick was missed.")])
+    drawings += picture.final_drawings()
     found = shown(drawings)
     assert {entity for entity in found if entity.count("/") == 1} >= {
         "/signals",
@@ -116,9 +116,9 @@ def test_new_connection_gets_the_earlier_drawings(short_chirps, shown):
     record = load_record(path)
     picture = Scene(description_of(record))
     for block in blocks(read_session(path).samples[:10_000], 1000):
-        picture.samples(block)
-    picture.events([Note(1_000_000, "info", "The record begins.")])
-    found = shown(picture.frame())
+        picture.sample_drawings(block)
+    picture.event_drawings([Note(1_000_000, "info", "The record begins.")])
+    found = shown(picture.initial_drawings())
     assert found[f"{MAGNITUDE_ENTITY}/measured"].values["LineStrips2D:strips"][-1][0]
     assert found["/spectrogram/levels"].last("DepthImage:buffer")
     assert found["/events"].values["TextLog:text"] == [["The record begins."]]
@@ -131,11 +131,11 @@ def known(value):
 def test_new_connections_get_earlier_touches(description, make_samples, shown):
     picture = Scene(description)
     for block in blocks(make_samples(2000), 100):
-        picture.samples(block)
+        picture.sample_drawings(block)
     touch = {"number": 1, "x_m": known(0.4), "time_s": known(1.5), "force_n": None}
-    picture.touches([touch])
-    picture.touches([touch | {"x_m": known(0.5)}])  # with more data
-    found = shown(picture.frame())["/antenna/touch/1/point"]
+    picture.touch_drawings([touch])
+    picture.touch_drawings([touch | {"x_m": known(0.5)}])  # with more data
+    found = shown(picture.initial_drawings())["/antenna/touch/1/point"]
     ((position,),) = found.values["Points3D:positions"]
     assert position[0] == pytest.approx(0.5 / description.beam.length_m)
 
@@ -167,9 +167,9 @@ def test_a_recorded_session_shows_its_touches(touch_file, drawn, make_timings):
 )
 def test_any_session_can_be_shown(description, make_samples, shown, changes):
     picture = Scene(replace(description, **changes))
-    drawings = [*picture.frame(), *picture.samples(make_samples(0))]
+    drawings = [*picture.initial_drawings(), *picture.sample_drawings(make_samples(0))]
     for samples in blocks(make_samples(3000, angle_rad=np.nan, coupling_torque_nm=np.nan), 700):
-        drawings += picture.samples(samples)
+        drawings += picture.sample_drawings(samples)
     for samples in blocks(make_samples(3000, first_tick=9000), 700):
-        drawings += picture.samples(samples)
-    assert shown([*drawings, *picture.finish(), *picture.frame()])
+        drawings += picture.sample_drawings(samples)
+    assert shown([*drawings, *picture.final_drawings(), *picture.initial_drawings()])

@@ -50,7 +50,7 @@ def health_values(description, shown):
     """Return the data of a reading for the plots of the health, by component."""
 
     def values(health):
-        found = shown(Scene(description).health(5, health))["/health"]
+        found = shown(Scene(description).health_drawings(5, health))["/health"]
         assert set(map(tuple, found.times_ns.values())) == {(5,)}
         return {name: column[0] for name, column in found.values.items()}
 

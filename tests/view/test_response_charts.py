@@ -107,7 +107,7 @@ def test_band_not_yet_excited_is_shaded_and_empty(description, shown):
     charts.update(20_000_000_000, estimate(description, excited_up_to_hz=20.0))
     after = shown([charts.draw])
     chart = charts.chart(MAGNITUDE_ENTITY)
-    left, _, right, _ = chart.frame
+    left, _, right, _ = chart.frame_edges
     at_20_hz = chart.to_canvas(20.0, chart.y.first)[0]
 
     def shaded(found, name) -> tuple[float, float]:

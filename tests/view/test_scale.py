@@ -5,7 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from rigd.view._layout import CLOSE_UP_S, TIME_VIEWS, Scale, TimeView, missing_ticks
+from rigd.view._layout import (
+    CLOSE_UP_WINDOW_S,
+    TIME_VIEWS,
+    AxisTickPoints,
+    TimeView,
+    missing_tick_values,
+)
 from rigd.view.plots import COUPLING_TORQUE, HEALTH, LOOP, READINGS, SIGNALS, Plot
 
 RATE_HZ = 1000
@@ -27,7 +33,7 @@ def labels(low: float, high: float, height: float) -> int:
     return last - first + 1
 
 
-@pytest.mark.parametrize("height", sorted({view.height for view in TIME_VIEWS}))
+@pytest.mark.parametrize("height", sorted({view.height_pt for view in TIME_VIEWS}))
 @pytest.mark.parametrize("middle", [0.0, 0.3, -1.0, 59.2481])
 def test_two_values_are_labelled_at_any_amplitude(middle, height):
     fills = []
@@ -35,7 +41,7 @@ def test_two_values_are_labelled_at_any_amplitude(middle, height):
     for amplitude in np.geomspace(1e-3, 1e3, 2000):
         low, high = middle - amplitude, middle + amplitude
         lacking += labels(low, high, height) < 2
-        ticks = [tick for tick in missing_ticks(low, high, height) if tick is not None]
+        ticks = [tick for tick in missing_tick_values(low, high, height) if tick is not None]
         assert labels(min(low, *ticks, high), max(low, *ticks, high), height) >= 2, amplitude
         fills.append((high - low) / (max(high, *ticks, low) - min(low, *ticks, high)))
     assert lacking > 100  # so it is not in vain
@@ -49,7 +55,7 @@ def test_two_values_are_labelled_at_any_amplitude(middle, height):
     [(0.0, 0.0), (59.25, 59.25), (0.0, 5e-324), (-1.7e308, 1.7e308), (1e300, 1e308)],
 )
 def test_single_and_absurd_values_need_nothing(low, high):
-    assert missing_ticks(low, high, 131.0) == (None, None)
+    assert missing_tick_values(low, high, 131.0) == (None, None)
 
 
 def view_of(plot: Plot, window_s: float) -> TimeView:
@@ -63,12 +69,12 @@ def test_axes_always_hold_two_labels(make_samples, shown):
     # Through all amplitudes in turn, as in a chirp that passes a resonance.
     torque_nm = 0.03 * 10 ** (2.5 * np.sin(np.pi * t_s / 30)) * np.sin(2 * np.pi * 5 * t_s)
     samples = make_samples(n, coupling_torque_nm=torque_nm)
-    scale = Scale(SIGNALS, TIME_VIEWS)
-    drawings = scale.frame()
+    scale = AxisTickPoints(SIGNALS, TIME_VIEWS)
+    drawings = scale.initial_drawings()
     for i in range(0, n, BLOCK):
         block = samples[i : i + BLOCK]
-        drawings += scale.draw(block["t_ns"], SIGNALS.columns(block))
-    view = view_of(COUPLING_TORQUE, CLOSE_UP_S)
+        drawings += scale.tick_drawings(block["t_ns"], SIGNALS.columns(block))
+    view = view_of(COUPLING_TORQUE, CLOSE_UP_WINDOW_S)
     ticks = shown(drawings)[SIGNALS.tick_entity]
     tick_ns = np.array(ticks.times_ns[view.tick_component])
     tick_values = np.array(ticks.values[view.tick_component])[:, 0]
@@ -80,7 +86,7 @@ def test_axes_always_hold_two_labels(make_samples, shown):
         seen = (tick_ns > now_ns - 2_000_000_000) & (tick_ns <= now_ns) & ~np.isnan(tick_values)
         least = min(low, *tick_values[seen], high)
         greatest = max(high, *tick_values[seen], low)
-        assert labels(least, greatest, view.height) >= 2, end
+        assert labels(least, greatest, view.height_pt) >= 2, end
         free.append(high - low > view.plot.min_span)
         fills.append(max(high - low, view.plot.min_span) / (greatest - least))
     assert min(fills) > 0.3
@@ -94,24 +100,24 @@ def test_single_steps_and_noise_do_not_fill_an_axis(view):
     for middle in (0.0, 7.0 * least, -0.3 * least):
         for span in (0.0, 0.01 * least, 0.4 * least):
             low, high = middle - span / 2, middle + span / 2
-            below, above = missing_ticks(low, high, view.height, least)
+            below, above = missing_tick_values(low, high, view.height_pt, least)
             first = low if below is None else below
             last = high if above is None else above
             assert first <= low <= high <= last
             assert least <= last - first <= 6.0 * least
-            assert labels(first, last, view.height) >= 2
+            assert labels(first, last, view.height_pt) >= 2
 
 
 def test_scale_does_not_depend_on_blocks(make_samples, shown):
     samples = make_samples(5000, coupling_torque_nm=0.06 * np.sin(np.arange(5000) / 30.0))
 
     def ticks(block: int):
-        scale = Scale(SIGNALS, TIME_VIEWS)
+        scale = AxisTickPoints(SIGNALS, TIME_VIEWS)
         drawings = []
         for i in range(0, len(samples), block):
             part = samples[i : i + block]
-            drawings += scale.draw(part["t_ns"], SIGNALS.columns(part))
-        name = view_of(COUPLING_TORQUE, CLOSE_UP_S).tick_component
+            drawings += scale.tick_drawings(part["t_ns"], SIGNALS.columns(part))
+        name = view_of(COUPLING_TORQUE, CLOSE_UP_WINDOW_S).tick_component
         found = shown(drawings)[SIGNALS.tick_entity]
         return found.times_ns[name], found.values[name]
 
@@ -120,7 +126,11 @@ def test_scale_does_not_depend_on_blocks(make_samples, shown):
 
 
 def test_every_view_gets_its_ticks_immediately(shown):
-    drawings = [d for s in (SIGNALS, READINGS, HEALTH) for d in Scale(s, TIME_VIEWS).frame()]
+    drawings = [
+        d
+        for s in (SIGNALS, READINGS, HEALTH)
+        for d in AxisTickPoints(s, TIME_VIEWS).initial_drawings()
+    ]
     found = shown(drawings)
     for view in TIME_VIEWS:
         assert (view.tick_component in found[view.source.tick_entity].values) == (
@@ -129,12 +139,12 @@ def test_every_view_gets_its_ticks_immediately(shown):
 
 
 def test_invalid_values_are_skipped(make_samples):
-    scale = Scale(SIGNALS, TIME_VIEWS)
+    scale = AxisTickPoints(SIGNALS, TIME_VIEWS)
     for value in (np.nan, np.inf, 1.7e308, -1.7e308):
         samples = make_samples(200, coupling_torque_nm=value)
-        scale.draw(samples["t_ns"], SIGNALS.columns(samples))
+        scale.tick_drawings(samples["t_ns"], SIGNALS.columns(samples))
     loop = make_samples(300, first_tick=200, work_ns=60_000)
     loop["t_ns"][150:] += 2**61  # another program's file
     loop["work_ns"][-1] = 0
-    assert scale.draw(loop["t_ns"], SIGNALS.columns(loop))
-    assert view_of(LOOP, 10.0).height < 150
+    assert scale.tick_drawings(loop["t_ns"], SIGNALS.columns(loop))
+    assert view_of(LOOP, 10.0).height_pt < 150

@@ -54,7 +54,7 @@ def test_tone_has_its_frequency_time_and_level(tone):
     level_db = LOWEST_DB + (HIGHEST_DB - LOWEST_DB) * image.max() / 255.0
     assert level_db == pytest.approx(-20.0, abs=0.6)  # of an amplitude of 0.1 N·m
     # The image ends where the session is, and inside the frame.
-    left, top, _, bottom = chart.frame
+    left, top, _, bottom = chart.frame_edges
     assert corner == pytest.approx([left, top])
     assert corner[1] + size[1] * image.shape[0] < bottom
     assert corner[0] + size[0] * image.shape[1] == pytest.approx(
@@ -80,7 +80,7 @@ def test_a_long_session_has_no_larger_image(description):
     from dataclasses import replace
 
     spectrogram = RunningSpectrogram(1000.0, step_s=STEP_S)
-    hour = replace(description, ticks=3_600_000)
+    hour = replace(description, scheduled_ticks=3_600_000)
     chart = SpectrogramChart(hour, spectrogram.frequency_hz, STEP_S)
     levels = np.full(spectrogram.frequency_hz.size, -40.0)
     chart.update(0, [(t_s, levels) for t_s in np.arange(0.5, 3600.0, STEP_S)])

@@ -25,7 +25,7 @@ def summary(description, shown):
     """Return the text that is shown of a reading of the health."""
 
     def text(t_ns, health):
-        found = shown(Scene(description).health(t_ns, health))
+        found = shown(Scene(description).health_drawings(t_ns, health))
         return found["/summary"].last("TextDocument:text")
 
     return text
