@@ -34,7 +34,7 @@ from rigd.view.plots import (
     Color,
     send_columns,
 )
-from rigd.view.rrd_file import RrdFileError, check_new, new_rrd_file
+from rigd.view.rrd_file import RrdFileError, check_new_rrd_file, new_rrd_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -624,7 +624,7 @@ def _labelled_axis_range(largest_value: float) -> tuple[float, float]:
 def check_rerun_file(path: Path) -> None:
     """Raise OutputExistsError if a path exists or does not have the suffix of a Rerun file."""
     try:
-        check_new(path)
+        check_new_rrd_file(path)
     except RrdFileError as error:
         raise OutputExistsError(f"--rerun {error}") from None
 

@@ -14,7 +14,13 @@ import typer
 
 from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, fail, task_progress
 from rigd.runtime import raise_on_signals
-from rigd.view.rrd_file import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
+from rigd.view.rrd_file import (
+    RRD_SUFFIX,
+    RrdFileError,
+    check_new_rrd_file,
+    check_rrd_file,
+    new_rrd_file,
+)
 
 if TYPE_CHECKING:
     from rigd.live import Viewer
@@ -249,8 +255,8 @@ def replay(
         _check_displayable(path)  # the same files are valid for a window and for other outputs
         file_advice = (
             "the file can be opened elsewhere"
-            if path.suffix == SUFFIX
-            else f"--save OUT{SUFFIX} writes a file that can be opened elsewhere"
+            if path.suffix == RRD_SUFFIX
+            else f"--save OUT{RRD_SUFFIX} writes a file that can be opened elsewhere"
         )
         fail(
             "There is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set). "
@@ -272,10 +278,10 @@ def _save_recording(path: Path, output_path: Path, *, is_web_requested: bool) ->
             "--save writes a file and shows nothing, so it cannot be combined with --web.",
             EXIT_WRONG_USE,
         )
-    if path.suffix == SUFFIX:
+    if path.suffix == RRD_SUFFIX:
         fail(f"{path} is a recording for Rerun already; copy it instead.", EXIT_WRONG_USE)
     try:
-        check_new(output_path)
+        check_new_rrd_file(output_path)
     except RrdFileError as error:
         fail(f"--save {error}", EXIT_WRONG_USE)
     _write_rerun_file(path, output_path)
@@ -286,7 +292,7 @@ def _check_displayable(path: Path) -> None:
     """Raise an error if the beginning of a file shows that it cannot be displayed."""
     from rigd.session import check_magic_bytes
 
-    if path.suffix == SUFFIX:
+    if path.suffix == RRD_SUFFIX:
         check_rrd_file(path)
     else:
         check_magic_bytes(path)
@@ -307,10 +313,10 @@ def _write_rerun_file(session_path: Path, output_path: Path) -> None:
 
 def _as_recording(path: Path, scratch_path: Path) -> Path:
     """Return the path of a Rerun file; convert it into `scratch_path` if `path` is a session."""
-    if path.suffix == SUFFIX:
+    if path.suffix == RRD_SUFFIX:
         check_rrd_file(path)
         return path
-    rerun_path = scratch_path / f"session{SUFFIX}"
+    rerun_path = scratch_path / f"session{RRD_SUFFIX}"
     _write_rerun_file(path, rerun_path)
     return rerun_path
 

@@ -40,8 +40,8 @@ from rigd.view.banner import (
     SUPERVISOR_SILENT,
     SUPERVISOR_SILENT_TORQUE_OFF,
     BannerState,
-    ended,
-    preparing,
+    ended_state,
+    preparing_state,
 )
 from rigd.view.frequency_charts import LastResponse
 from rigd.view.rrd_file import prepare_sdk_environment
@@ -309,7 +309,7 @@ class _ShownSession:
         self.reader.set_end(end_message.ends)
         self.queue_new_records()
         view_scene, t_ns = self.reader.scene, self.reader.t_ns
-        banner_state = ended(end_message.outcome, end_message.reason)
+        banner_state = ended_state(end_message.outcome, end_message.reason)
         if self.supervisor_lost:
             is_torque_off = self._shared_state[StateField.PHASE] == Phase.OFF
             banner_state = SUPERVISOR_LOST_TORQUE_OFF if is_torque_off else SUPERVISOR_LOST
@@ -539,7 +539,7 @@ class SessionStateReader:
                 return SUPERVISOR_SILENT_TORQUE_OFF
         current_activity = activity(shared_state)
         if current_activity is Activity.PREPARING:
-            return preparing(
+            return preparing_state(
                 "" if session_phase is Phase.OFF else f"{session_phase.display_text}.".capitalize()
             )
         return _ACTIVITY_BANNERS[current_activity]

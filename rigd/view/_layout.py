@@ -29,9 +29,9 @@ from rigd.view.frequency_charts import (
     MAGNITUDE_ENTITY,
     OVERVIEW_MAGNITUDE_ENTITY,
     PHASE_ENTITY,
+    SPECTROGRAM_CANVAS_SIZE,
     SPECTROGRAM_ENTITY,
 )
-from rigd.view.frequency_charts import SIZE as SPECTROGRAM_SIZE
 from rigd.view.plots import TIMELINE, Drawing, Plot, PlotSource, Values, send_columns
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def _overview_tab() -> "rrb.Container":
     """Return the contents of the tab Overview: state, gauges, antenna, plots and response."""
     import rerun.blueprint as rrb
 
-    state_view, gauges_view = banner.views()
+    state_view, gauges_view = banner.state_and_gauge_views()
     return rrb.Vertical(
         rrb.Horizontal(state_view, gauges_view, column_shares=[6, 7]),
         rrb.Horizontal(
@@ -226,7 +226,9 @@ def _spectrogram_tab() -> "rrb.Container":
     import rerun.blueprint as rrb
 
     return rrb.Vertical(
-        chart_view("Spectrogram of the coupling torque", SPECTROGRAM_ENTITY, SPECTROGRAM_SIZE)
+        chart_view(
+            "Spectrogram of the coupling torque", SPECTROGRAM_ENTITY, SPECTROGRAM_CANVAS_SIZE
+        )
     )
 
 
@@ -295,7 +297,7 @@ def _time_series_view(time_view: TimeView) -> "rrb.TimeSeriesView":
     visualizers: dict[EntityPath | str, rrb.Visualizer] = {
         time_view.source.entity: line_style.visualizer(mappings=[_values_mapping(plot.component)])
     }
-    if plot.span is None:
+    if plot.fixed_axis_range is None:
         visualizers[time_view.source.tick_entity] = tick_style.visualizer(
             mappings=[_values_mapping(time_view.tick_component)]
         )
@@ -317,7 +319,9 @@ def _time_series_view(time_view: TimeView) -> "rrb.TimeSeriesView":
         ),
         # The default is a minute around the cursor, half of it in the future.
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start_boundary, end=end_boundary)),
-        axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),
+        axis_y=None
+        if plot.fixed_axis_range is None
+        else rrb.ScalarAxis(range=plot.fixed_axis_range),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start_boundary, end=end_boundary),
     )
 
@@ -435,7 +439,7 @@ class AxisTickPoints:
         self._axes = [
             _AxisExtremes(time_view)
             for time_view in views
-            if time_view.source is source and time_view.plot.span is None
+            if time_view.source is source and time_view.plot.fixed_axis_range is None
         ]
 
     def initial_drawings(self) -> list[Drawing]:

@@ -26,7 +26,7 @@ from rigd.view._session_info import (
     linear_sweep_band_hz,
     outcome_note,
 )
-from rigd.view.banner import ended
+from rigd.view.banner import ended_state
 from rigd.view.plots import AGES, FAULTY_TICKS, HEALTH, REAL_TIME_PLOT_COMPONENTS, TIMELINE
 
 if TYPE_CHECKING:
@@ -181,10 +181,10 @@ def draw_session(
         ),
     )
     outcome_document = session.outcome or {}
-    banner_state = ended(
+    banner_state = ended_state(
         outcome_document.get("outcome", "no outcome"), outcome_document.get("reason", "")
     )
-    scene.state_drawings(0, replace(banner_state, over=False))
+    scene.state_drawings(0, replace(banner_state, is_over=False))
     # The viewer shows session time only, not the time of drawing.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)

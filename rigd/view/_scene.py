@@ -24,7 +24,7 @@ from rigd.view._session_info import (
     send_recent_notes,
     send_summary,
 )
-from rigd.view.banner import BannerState, preparing
+from rigd.view.banner import BannerState, preparing_state
 from rigd.view.frequency_charts import (
     LastResponse,
     ResponseCharts,
@@ -116,7 +116,7 @@ class Scene:
         self._gauges = Gauges(session.rate_hz, session.limits, session.thermal_time_constant_s)
         self._peaks: dict[str, Gauge] = {}
         self._peaks_are_drawn = False
-        self._state, self._health, self._health_ns = preparing(), Health(), 0
+        self._state, self._health, self._health_ns = preparing_state(), Health(), 0
         self._t_ns = 0
 
     @property
@@ -266,7 +266,7 @@ class Scene:
     def _draw_banner(self) -> list[Drawing]:
         """Return functions that draw the session's state and its gauges."""
         session, t_ns, health_reading = self._session, self._health_ns, self._health
-        gauge_of_missed_ticks = banner.missed_gauge(session, t_ns, health_reading)
+        gauge_of_missed_ticks = banner.missed_ticks_gauge(session, t_ns, health_reading)
         return [
             partial(
                 banner.send_banner,
@@ -276,7 +276,7 @@ class Scene:
                 health=health_reading,
             ),
             partial(
-                banner.send_values,
+                banner.send_gauges,
                 state=self._state,
                 t_ns=t_ns,
                 gauges={**self._peaks, "missed": gauge_of_missed_ticks},
@@ -293,7 +293,10 @@ class Scene:
 
     def _plot_records(self, record_source: PlotSource, records: Records) -> list[Drawing]:
         """Return functions that plot the records of a source over time."""
-        t_ns, plot_values = records["t_ns"].astype(np.int64), record_source.columns(records)
+        t_ns, plot_values = (
+            records["t_ns"].astype(np.int64),
+            record_source.values_by_component(records),
+        )
         return [
             partial(send_columns, entity=record_source.entity, t_ns=t_ns, columns=plot_values),
             *self._axis_tick_points[record_source].tick_drawings(t_ns, plot_values),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from rigd.gauges import WARNING_FRACTION, Gauge
 from rigd.view._session_info import escape_markdown
-from rigd.view.chart import LABEL_DROP
+from rigd.view.chart import LABEL_DROP_PT
 from rigd.view.plots import GREEN, GREY, ORANGE, RED, SKY_BLUE, TIMELINE, Color
 
 if TYPE_CHECKING:
@@ -28,20 +28,20 @@ class BannerState:
 
     Attributes
     ----------
-    word
+    state_name
         Name of the state in capitals.
     color
         Colour of the band above the gauges. Red is for alarms only.
     reason
         Reason for the state; empty if there is none.
-    over
+    is_over
         Whether the session is over, so that no remaining time is shown.
     """
 
-    word: str
+    state_name: str
     color: Color
     reason: str = ""
-    over: bool = False
+    is_over: bool = False
 
 
 RUNNING: Final = BannerState("RUNNING", SKY_BLUE)
@@ -67,22 +67,22 @@ SUPERVISOR_LOST: Final = BannerState(
     RED,
     "The supervising process ended. The control process ends the session and commands the torque "
     "off; press the wired stop (STO) if anything moves.",
-    over=True,
+    is_over=True,
 )
 """State after the supervising process ended before the session."""
 SUPERVISOR_LOST_TORQUE_OFF: Final = BannerState(
     "SUPERVISOR LOST",
     RED,
     "The supervising process ended; the torque is off.",
-    over=True,
+    is_over=True,
 )
 """State if the supervising process ended and the drive has shown that it is off."""
 
-_COLOR_OF_OUTCOME: Final = {"complete": GREEN, "stopped": GREY, "fault": RED}
+_COLORS_BY_OUTCOME: Final = {"complete": GREEN, "stopped": GREY, "fault": RED}
 """Colour of the band after a session, by its outcome."""
 
 
-def preparing(activity: str = "") -> BannerState:
+def preparing_state(activity: str = "") -> BannerState:
     """Return the banner's state for a session before its record.
 
     Parameters
@@ -93,7 +93,7 @@ def preparing(activity: str = "") -> BannerState:
     return BannerState("PREPARING", ORANGE, activity)
 
 
-def ended(outcome_name: str, end_reason: str) -> BannerState:
+def ended_state(outcome_name: str, end_reason: str) -> BannerState:
     """Return the banner's state for a session that is over.
 
     Parameters
@@ -103,7 +103,7 @@ def ended(outcome_name: str, end_reason: str) -> BannerState:
     """
     state_name = outcome_name.upper() or "ENDED"
     return BannerState(
-        state_name, _COLOR_OF_OUTCOME.get(outcome_name, ORANGE), end_reason, over=True
+        state_name, _COLORS_BY_OUTCOME.get(outcome_name, ORANGE), end_reason, is_over=True
     )
 
 
@@ -125,7 +125,7 @@ def banner(session: "SessionDescription", state: BannerState, t_ns: int, health:
         Health reading at that time.
     """
     remaining_s = session.scheduled_ticks / session.rate_hz - 1e-9 * t_ns
-    heading = f"# {'Recorded: ' if session.is_recorded else ''}{state.word}"
+    heading = f"# {'Recorded: ' if session.is_recorded else ''}{state.state_name}"
     if state is RUNNING and remaining_s > 0.0:
         heading += f" · {math.ceil(remaining_s)} s left"
     banner_lines = [heading]
@@ -135,7 +135,7 @@ def banner(session: "SessionDescription", state: BannerState, t_ns: int, health:
             if state.color == RED
             else escape_markdown(state.reason)
         )
-    if not state.over and health.missed_ticks:
+    if not state.is_over and health.missed_ticks:
         missed_percent = 100.0 * health.missed_ticks / max(1e-9 * t_ns * session.rate_hz, 1.0)
         banner_lines.append(
             f"Computer overloaded: {health.missed_ticks:.0f} ticks missed ({missed_percent:.2g} %)."
@@ -146,7 +146,7 @@ def banner(session: "SessionDescription", state: BannerState, t_ns: int, health:
         back_sweep_text = "" if session.return_sweep is None else f" → {start_hz:g}"
         excitation_text += f" {start_hz:g} → {stop_hz:g}{back_sweep_text} Hz"
     sweep_tick = round(1e-9 * t_ns * session.rate_hz)
-    if not state.over and (frequency_hz := session.frequency_hz(sweep_tick)) is not None:
+    if not state.is_over and (frequency_hz := session.frequency_hz(sweep_tick)) is not None:
         excitation_text += f", now **{frequency_hz:.3g} Hz**"
     if session.specimen:
         excitation_text += f", specimen **{escape_markdown(session.specimen)}**"
@@ -185,7 +185,7 @@ def send_banner(
 
 # Values with their limits
 
-GAUGES_SIZE: Final = (700.0, 132.0)
+GAUGES_CANVAS_SIZE: Final = (700.0, 132.0)
 """Width and height of the canvas with the gauges, in points."""
 _BAND_HEIGHT_PT: Final = 14.0
 """Height of the coloured band above the gauges, in points."""
@@ -215,7 +215,7 @@ _GAUGE_LABELS: Final = {
 """Labels of the gauges by signal name: first the left column, then the right one."""
 
 
-def missed_gauge(session: "SessionDescription", t_ns: int, health: "Health") -> Gauge:
+def missed_ticks_gauge(session: "SessionDescription", t_ns: int, health: "Health") -> Gauge:
     """Return the gauge of missed ticks, in percent of the ticks so far, with its limit.
 
     Parameters
@@ -248,8 +248,8 @@ def gauge_text(gauge_label: str, gauge: Gauge) -> str:
     if gauge.limit is None:
         return f"{gauge_label} {gauge.value:.3g} {gauge.unit}"
     # The resolution is a thousandth of the limit, with a constant number of digits.
-    digits = max(0, 3 - math.floor(math.log10(gauge.limit)))
-    return f"{gauge_label} {gauge.value:.{digits}f} of {gauge.limit:.3g} {gauge.unit}"
+    decimal_count = max(0, 3 - math.floor(math.log10(gauge.limit)))
+    return f"{gauge_label} {gauge.value:.{decimal_count}f} of {gauge.limit:.3g} {gauge.unit}"
 
 
 def gauge_color(gauge: Gauge) -> Color:
@@ -260,13 +260,19 @@ def gauge_color(gauge: Gauge) -> Color:
     gauge
         Value and limit of the signal.
     """
-    limit_fraction = gauge.fraction
-    if limit_fraction is None:
+    fraction_of_limit = gauge.fraction
+    if fraction_of_limit is None:
         return GREY
-    return RED if limit_fraction >= 1.0 else ORANGE if limit_fraction >= WARNING_FRACTION else GREEN
+    return (
+        RED
+        if fraction_of_limit >= 1.0
+        else ORANGE
+        if fraction_of_limit >= WARNING_FRACTION
+        else GREEN
+    )
 
 
-def send_values(
+def send_gauges(
     stream: "RecordingStream", state: BannerState, t_ns: int, gauges: Mapping[str, Gauge]
 ) -> None:
     """Send a band in the state's colour and the bars and texts of the gauges to Rerun.
@@ -285,7 +291,7 @@ def send_values(
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    canvas_width, _ = GAUGES_SIZE
+    canvas_width, _ = GAUGES_CANVAS_SIZE
     bar_lines, bar_colors, bar_radii = (
         [[[0.0, 8.0], [canvas_width, 8.0]]],
         [state.color],
@@ -296,11 +302,14 @@ def send_values(
         gauge = gauges.get(signal_name)
         if gauge is None:
             continue
-        gauge_column, row = divmod(gauge_index, _GAUGES_PER_COLUMN)
-        x, y = gauge_column * (canvas_width / 2 + 10.0), _FIRST_ROW_Y_PT + row * _ROW_HEIGHT_PT
+        gauge_column, gauge_row = divmod(gauge_index, _GAUGES_PER_COLUMN)
+        x, y = (
+            gauge_column * (canvas_width / 2 + 10.0),
+            _FIRST_ROW_Y_PT + gauge_row * _ROW_HEIGHT_PT,
+        )
         value_text, bar_color = gauge_text(gauge_label, gauge), gauge_color(gauge)
         # Rerun centres a label, whose width is not known here.
-        label_positions.append([x + _GAUGE_TEXT_WIDTH_PT / 2, y - LABEL_DROP])
+        label_positions.append([x + _GAUGE_TEXT_WIDTH_PT / 2, y - LABEL_DROP_PT])
         label_texts.append(value_text)
         label_colors.append(GREY if bar_color == GREEN else bar_color)
         bar_left = x + _GAUGE_TEXT_WIDTH_PT
@@ -324,11 +333,11 @@ def send_values(
     )
 
 
-def views() -> "tuple[rrb.View, rrb.View]":
+def state_and_gauge_views() -> "tuple[rrb.View, rrb.View]":
     """Return Rerun's views of the session's state and of the gauges."""
     import rerun.blueprint as rrb
 
-    canvas_width, canvas_height = GAUGES_SIZE
+    canvas_width, canvas_height = GAUGES_CANVAS_SIZE
     return (
         rrb.TextDocumentView(name="State", origin=STATE_ENTITY),
         rrb.Spatial2DView(

@@ -23,20 +23,20 @@ RealArray = npt.NDArray[np.float64]
 
 # Chart
 
-_LEFT_MARGIN, _TOP_MARGIN, _BOTTOM_MARGIN = 62.0, 44.0, 54.0
+_LEFT_MARGIN_PT, _TOP_MARGIN_PT, _BOTTOM_MARGIN_PT = 62.0, 44.0, 54.0
 """Margins for tick labels and titles left of, above and below the frame, in points."""
-_RIGHT_MARGIN = 24.0
+_RIGHT_MARGIN_PT = 24.0
 """Margin on the right of the frame, in points."""
-_TITLE_DISTANCE = 27.0
+_TITLE_DISTANCE_PT = 27.0
 """Distance of the middle of titles and legend above the frame, in points."""
 
-LABEL_DROP = 12.0
+LABEL_DROP_PT = 12.0
 """Distance by which Rerun draws the middle of a label below its position, in points."""
-_CHARACTER_WIDTH = 6.7
+_MEAN_CHARACTER_WIDTH_PT = 6.7
 """Mean width of a character in a label, in points."""
-_DOT_SPACING = 6.0
+_GRID_DOT_SPACING_PT = 6.0
 """Distance between the dots of a grid line, in points."""
-_CURVE_DOT_RADIUS = 1.0
+_CURVE_DOT_RADIUS_PT = 1.0
 """Radius of the dots of a dotted curve, in points."""
 _SHADE_OPACITY = 0.18
 """Opacity of shaded areas, from 0 to 1."""
@@ -50,31 +50,31 @@ class Axis:
     ----------
     title
         Title with its unit.
-    first, last
+    start_value, end_value
         Values at the lower (or left) end and at the upper (or right) end.
     ticks
         Values with a tick label and a grid line.
-    lines
+    grid_lines
         Values with a grid line but without a tick label.
-    logarithmic
+    is_logarithmic
         Whether the axis is logarithmic.
     """
 
     title: str
-    first: float
-    last: float
+    start_value: float
+    end_value: float
     ticks: tuple[float, ...]
-    lines: tuple[float, ...] = ()
-    logarithmic: bool = False
+    grid_lines: tuple[float, ...] = ()
+    is_logarithmic: bool = False
 
-    def fraction(self, axis_values: npt.ArrayLike) -> RealArray:
+    def fractions_along(self, axis_values: npt.ArrayLike) -> RealArray:
         """Return the positions of values on the axis, from 0 (first) to 1 (last), clipped."""
         axis_positions, axis_start, axis_end = (
             np.asarray(axis_values, dtype=np.float64),
-            self.first,
-            self.last,
+            self.start_value,
+            self.end_value,
         )
-        if self.logarithmic:
+        if self.is_logarithmic:
             axis_positions, axis_start, axis_end = (
                 np.log(np.maximum(axis_positions, axis_start)),
                 np.log(axis_start),
@@ -117,7 +117,7 @@ class Chart:
         Horizontal and vertical axis.
     legend
         Entries of the legend, in reading order.
-    left, right
+    left_margin, right_margin
         Margins left and right of the frame, in points.
     """
 
@@ -127,8 +127,8 @@ class Chart:
     x: Axis
     y: Axis
     legend: tuple[LegendEntry, ...] = ()
-    left: float = _LEFT_MARGIN
-    right: float = _RIGHT_MARGIN
+    left_margin: float = _LEFT_MARGIN_PT
+    right_margin: float = _RIGHT_MARGIN_PT
 
     @property
     def frame_edges(self) -> tuple[float, float, float, float]:
@@ -136,7 +136,12 @@ class Chart:
 
         As in all of Rerun's canvases, the vertical coordinate increases downwards.
         """
-        return self.left, _TOP_MARGIN, self.width - self.right, self.height - _BOTTOM_MARGIN
+        return (
+            self.left_margin,
+            _TOP_MARGIN_PT,
+            self.width - self.right_margin,
+            self.height - _BOTTOM_MARGIN_PT,
+        )
 
     def to_canvas(self, x: npt.ArrayLike, y: npt.ArrayLike) -> RealArray:
         """Return the canvas coordinates (n, 2) of points with given values on the axes.
@@ -149,7 +154,9 @@ class Chart:
             Values on the horizontal and on the vertical axis, shape (n,).
         """
         frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
-        x_fraction, y_fraction = np.broadcast_arrays(self.x.fraction(x), self.y.fraction(y))
+        x_fraction, y_fraction = np.broadcast_arrays(
+            self.x.fractions_along(x), self.y.fractions_along(y)
+        )
         return np.stack(
             [
                 frame_left + (frame_right - frame_left) * x_fraction,
@@ -187,7 +194,7 @@ class Chart:
         return [
             (
                 tick_text(tick_value),
-                float(self.to_canvas(tick_value, self.y.first)[0]),
+                float(self.to_canvas(tick_value, self.y.start_value)[0]),
                 frame_bottom + 14.0,
             )
             for tick_value in self.x.ticks
@@ -195,7 +202,7 @@ class Chart:
             (
                 tick_text(tick_value),
                 frame_left - 26.0,
-                float(self.to_canvas(self.x.first, tick_value)[1]),
+                float(self.to_canvas(self.x.start_value, tick_value)[1]),
             )
             for tick_value in self.y.ticks
         ]
@@ -203,9 +210,9 @@ class Chart:
     def draw_curve(
         self,
         stream: "RecordingStream",
-        name: str,
+        curve_name: str,
         strips: Sequence[RealArray],
-        key: LegendEntry,
+        legend_entry: LegendEntry,
         *,
         static: bool = False,
         dotted: bool = False,
@@ -215,7 +222,7 @@ class Chart:
 
         Parameters
         ----------
-        stream, name, strips, key
+        stream, curve_name, strips, legend_entry
             Recording to draw into, name of the curve under the chart's entity path, points of each
             strip, and style of the curve.
         static
@@ -234,19 +241,19 @@ class Chart:
         drawn_curve = (
             rr.Points2D(
                 np.concatenate(canvas_strips or [np.zeros((0, 2))]),
-                colors=[key.color],
-                radii=rr.Radius.ui_points(_CURVE_DOT_RADIUS),
+                colors=[legend_entry.color],
+                radii=rr.Radius.ui_points(_CURVE_DOT_RADIUS_PT),
                 draw_order=draw_order,
             )
             if dotted
             else rr.LineStrips2D(
                 canvas_strips,
-                colors=[key.color],
-                radii=rr.Radius.ui_points(key.width / 2),
+                colors=[legend_entry.color],
+                radii=rr.Radius.ui_points(legend_entry.width / 2),
                 draw_order=draw_order,
             )
         )
-        stream.log(f"{self.entity}/{name}", drawn_curve, static=static)
+        stream.log(f"{self.entity}/{curve_name}", drawn_curve, static=static)
 
     def draw_note(self, stream: "RecordingStream", note_text: str, text_color: Color) -> None:
         """Write a text into the middle of the frame; an empty text removes the previous text.
@@ -263,7 +270,10 @@ class Chart:
         import rerun as rr
 
         frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
-        frame_middle = [(frame_left + frame_right) / 2, (frame_top + frame_bottom) / 2 - LABEL_DROP]
+        frame_middle = [
+            (frame_left + frame_right) / 2,
+            (frame_top + frame_bottom) / 2 - LABEL_DROP_PT,
+        ]
         stream.log(
             f"{self.entity}/note",
             rr.Points2D(
@@ -320,7 +330,7 @@ class Chart:
             Values of the horizontal axis at the left and right end of the area.
         """
         _, frame_top, _, frame_bottom = self.frame_edges
-        shade_left, shade_right = self.to_canvas([first_x, last_x], self.y.first)[:, 0]
+        shade_left, shade_right = self.to_canvas([first_x, last_x], self.y.start_value)[:, 0]
         self._position_shade(stream, shade_name, (shade_left, frame_top, shade_right, frame_bottom))
 
     def _draw_labels(self, stream: "RecordingStream") -> None:
@@ -329,26 +339,26 @@ class Chart:
 
         frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
         frame_middle = (frame_left + frame_right) / 2
-        placed_labels = [
+        labels_with_positions = [
             *self.tick_labels(),
             (
                 self.y.title,
                 frame_left - 44.0 + _label_width(self.y.title) / 2,
-                frame_top - _TITLE_DISTANCE,
+                frame_top - _TITLE_DISTANCE_PT,
             ),
         ]
         if self.x.title:
-            placed_labels.append((self.x.title, frame_middle, frame_bottom + 40.0))
-        placed_labels += [
+            labels_with_positions.append((self.x.title, frame_middle, frame_bottom + 40.0))
+        labels_with_positions += [
             (key.label, x + _label_width(key.label) / 2, y)
             for key, x, y in self._legend_positions()
         ]
         stream.log(
             f"{self.entity}/labels",
             rr.Points2D(
-                [[x, y - LABEL_DROP] for _, x, y in placed_labels],
-                labels=[label_text for label_text, _, _ in placed_labels],
-                colors=[GREY] * (len(placed_labels) - len(self.legend))
+                [[x, y - LABEL_DROP_PT] for _, x, y in labels_with_positions],
+                labels=[label_text for label_text, _, _ in labels_with_positions],
+                colors=[GREY] * (len(labels_with_positions) - len(self.legend))
                 + [key.color for key in self.legend],
                 radii=0.0,
                 show_labels=True,
@@ -361,18 +371,22 @@ class Chart:
         import rerun as rr
 
         frame_left, frame_top, frame_right, frame_bottom = self.frame_edges
-        vertical_line_x = self.to_canvas([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
-        horizontal_line_y = self.to_canvas(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
+        vertical_line_x = self.to_canvas([*self.x.ticks, *self.x.grid_lines], self.y.start_value)[
+            :, 0
+        ]
+        horizontal_line_y = self.to_canvas(self.x.start_value, [*self.y.ticks, *self.y.grid_lines])[
+            :, 1
+        ]
         dot_positions = [
             *(
                 [x, y]
                 for x in vertical_line_x
-                for y in np.arange(frame_bottom, frame_top, -_DOT_SPACING)
+                for y in np.arange(frame_bottom, frame_top, -_GRID_DOT_SPACING_PT)
             ),
             *(
                 [x, y]
                 for y in horizontal_line_y
-                for x in np.arange(frame_left, frame_right, _DOT_SPACING)
+                for x in np.arange(frame_left, frame_right, _GRID_DOT_SPACING_PT)
             ),
         ]
         stream.log(
@@ -432,13 +446,13 @@ class Chart:
     def _legend_positions(self) -> list[tuple[LegendEntry, float, float]]:
         """Return the legend's entries with positions (x, y) above the frame, right-aligned."""
         _, frame_top, right_edge, _ = self.frame_edges
-        placed_entries = []
+        entries_with_positions = []
         x = right_edge
         for key in reversed(self.legend):
             x -= _label_width(key.label)
-            placed_entries.append((key, x, frame_top - _TITLE_DISTANCE))
+            entries_with_positions.append((key, x, frame_top - _TITLE_DISTANCE_PT))
             x -= 46.0
-        return placed_entries[::-1]
+        return entries_with_positions[::-1]
 
 
 def tick_text(tick_value: float) -> str:
@@ -448,10 +462,12 @@ def tick_text(tick_value: float) -> str:
 
 def _label_width(label_text: str) -> float:
     """Return the approximate width of a text in a label, in points."""
-    return _CHARACTER_WIDTH * len(label_text)
+    return _MEAN_CHARACTER_WIDTH_PT * len(label_text)
 
 
-def decades(first_value: float, last_value: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def decade_ticks(
+    first_value: float, last_value: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return ticks (1, 2 and 5 in each decade) and further grid lines of a logarithmic axis.
 
     Parameters
@@ -461,8 +477,8 @@ def decades(first_value: float, last_value: float) -> tuple[tuple[float, ...], t
 
     Examples
     --------
-    >>> from rigd.view.chart import decades
-    >>> decades(0.5, 20.0)[0]
+    >>> from rigd.view.chart import decade_ticks
+    >>> decade_ticks(0.5, 20.0)[0]
     (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     """
     decade_exponents = range(
@@ -484,32 +500,32 @@ def decades(first_value: float, last_value: float) -> tuple[tuple[float, ...], t
     )
 
 
-def steps(first_value: float, last_value: float, max_steps: int) -> tuple[float, ...]:
-    """Return at most `max_steps` evenly spaced round values within a range, for axis ticks.
+def round_ticks(first_value: float, last_value: float, max_ticks: int) -> tuple[float, ...]:
+    """Return at most `max_ticks` evenly spaced round values within a range, for axis ticks.
 
     Parameters
     ----------
     first_value, last_value
         Values at both ends of the axis.
-    max_steps
+    max_ticks
         Largest number of values.
 
     Examples
     --------
-    >>> from rigd.view.chart import steps
-    >>> steps(1.0, 47.0, 6)
+    >>> from rigd.view.chart import round_ticks
+    >>> round_ticks(1.0, 47.0, 6)
     (10.0, 20.0, 30.0, 40.0)
     """
-    least_step = (last_value - first_value) / max_steps
-    power_of_ten = 10.0 ** np.floor(np.log10(least_step))
-    step_size = next(
+    least_tick_step = (last_value - first_value) / max_ticks
+    power_of_ten = 10.0 ** np.floor(np.log10(least_tick_step))
+    tick_step = next(
         leading_digit * power_of_ten
         for leading_digit in (1.0, 2.0, 5.0, 10.0)
-        if leading_digit * power_of_ten >= least_step
+        if leading_digit * power_of_ten >= least_tick_step
     )
     first_index, last_index = (
-        np.ceil(first_value / step_size - 1e-9),
-        np.floor(last_value / step_size + 1e-9),
+        np.ceil(first_value / tick_step - 1e-9),
+        np.floor(last_value / tick_step + 1e-9),
     )
-    step_values = step_size * np.arange(first_index, last_index + 1) + 0.0  # adding turns −0 into 0
-    return tuple(float(f"{step_value:.9g}") for step_value in step_values)
+    tick_values = tick_step * np.arange(first_index, last_index + 1) + 0.0  # adding turns −0 into 0
+    return tuple(float(f"{step_value:.9g}") for step_value in tick_values)

@@ -16,7 +16,7 @@ from rigd.sweep_response import (
     nominal_response,
     response_decimation,
 )
-from rigd.view.chart import Axis, Chart, LegendEntry, decades, steps
+from rigd.view.chart import Axis, Chart, LegendEntry, decade_ticks, round_ticks
 from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
 if TYPE_CHECKING:
@@ -63,12 +63,12 @@ COHERENCE_ENTRY: Final = LegendEntry("coherence", GREEN)
 NOT_ESTIMATED_ENTRY: Final = LegendEntry("not estimated", GREY, is_area=True)
 """Legend entry of the frequency bands that the reference has not excited so far."""
 
-NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
+NO_COHERENCE_YET_TEXT: Final = "Coherence begins with the second segment"
 """Text in the coherence chart of a running session before the end of the second segment."""
-NO_COHERENCE: Final = "A single segment gives no coherence"
+NO_COHERENCE_TEXT: Final = "A single segment gives no coherence"
 """Text in the coherence chart of a finished response from a single segment."""
 
-_MAX_WIDTH_FOR_FOUR_ENTRIES: Final = 700.0
+_MAX_FOUR_ENTRY_CHART_WIDTH_PT: Final = 700.0
 """Width in points above which a chart's legend has room for a fifth entry."""
 _SHADE_NAMES: Final = ("not_estimated_below", "not_estimated_above")
 """Names of the shaded areas over the bands that are not estimated."""
@@ -115,11 +115,11 @@ class _ResponseCurve:
 
     chart: Chart
     """Chart that contains the curve."""
-    key: LegendEntry
+    legend_entry: LegendEntry
     """Label and style of the curve."""
-    values: Callable[["FrequencyResponse"], RealArray]
+    values_of_response: Callable[["FrequencyResponse"], RealArray]
     """Function that returns the curve's values for an estimated response."""
-    from_complex: Callable[[ComplexArray], RealArray] | None = None
+    values_of_complex: Callable[[ComplexArray], RealArray] | None = None
     """Function that returns the curve's values for a complex response; None for the coherence."""
 
 
@@ -141,19 +141,21 @@ class ResponseCharts:
         frequency_hz, model_response = nominal_response(
             session.beam, session.damping or _ASSUMED_DAMPING, session.tool_inertia_kg_m2
         )
-        model_db = magnitude_db(model_response)
-        magnitude_chart_axis = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
-        damping_is_known = session.damping is not None
-        extra_entries = ((MODEL_ENTRY,) if damping_is_known else ()) + (
+        model_magnitude_db = magnitude_db(model_response)
+        magnitude_chart_axis = magnitude_axis(
+            model_magnitude_db.min() - 3.0, model_magnitude_db.max() + 6.0
+        )
+        is_damping_known = session.damping is not None
+        optional_entries = ((MODEL_ENTRY,) if is_damping_known else ()) + (
             (LAST_SESSION_ENTRY,) if last_response else ()
         )
-        legend_entries = (MEASURED_ENTRY, UNCERTAIN_ENTRY, *extra_entries)
+        legend_entries = (MEASURED_ENTRY, UNCERTAIN_ENTRY, *optional_entries)
         # The title of the view names the quantity.
         axis_with_short_title = replace(magnitude_chart_axis, title="dB re 1 N·m/rad")
         self._response_curves = (
             *(
                 _ResponseCurve(
-                    _chart(entity_path, vertical_axis, *legend_entries),
+                    _response_chart(entity_path, vertical_axis, *legend_entries),
                     MEASURED_ENTRY,
                     _magnitude_db,
                     magnitude_db,
@@ -164,13 +166,13 @@ class ResponseCharts:
                 )
             ),
             _ResponseCurve(
-                _chart(PHASE_ENTITY, PHASE_AXIS, *legend_entries),
+                _response_chart(PHASE_ENTITY, PHASE_AXIS, *legend_entries),
                 MEASURED_ENTRY,
                 _phase_deg,
                 phase_deg,
             ),
             _ResponseCurve(
-                _chart(COHERENCE_ENTITY, COHERENCE_AXIS, COHERENCE_ENTRY),
+                _response_chart(COHERENCE_ENTITY, COHERENCE_AXIS, COHERENCE_ENTRY),
                 COHERENCE_ENTRY,
                 _coherence,
             ),
@@ -180,14 +182,14 @@ class ResponseCharts:
             "output_delay_s": session.torque_delay_s,
         }
         decimation = response_decimation(frequency_hz)
-        magnitude_strips = decimation.strips(model_db)
+        magnitude_strips = decimation.strips(model_magnitude_db)
         self._models = (
             {
                 OVERVIEW_MAGNITUDE_ENTITY: magnitude_strips,
                 MAGNITUDE_ENTITY: magnitude_strips,
                 PHASE_ENTITY: decimation.strips(phase_deg(model_response)),
             }
-            if damping_is_known
+            if is_damping_known
             else {}
         )
         self._last_curves = (
@@ -201,7 +203,7 @@ class ResponseCharts:
         self._curves: dict[str, Sequence[RealArray]] = {}
         self._uncertain: dict[str, Sequence[RealArray]] = {}
         self._excited_hz = (HIGHEST_SHOWN_HZ, HIGHEST_SHOWN_HZ)
-        self._note = NO_COHERENCE_YET
+        self._note = NO_COHERENCE_YET_TEXT
 
     def chart(self, entity_path: str) -> Chart:
         """Return the chart with a given entity path in Rerun."""
@@ -255,20 +257,20 @@ class ResponseCharts:
         is_coherent = is_excited
         if corrected_response.coherence is not None:
             is_coherent = is_excited & (corrected_response.coherence >= LOW_COHERENCE)
-        decimated_strips = self._thinning.strips
+        decimate_to_strips = self._thinning.strips
         self._curves, self._uncertain = {}, {}
         for response_curve in self._response_curves:
             curve_values, entity_path = (
-                response_curve.values(corrected_response),
+                response_curve.values_of_response(corrected_response),
                 response_curve.chart.entity,
             )
             # The coherence itself is always reliable.
-            is_reliable = is_coherent if response_curve.from_complex else is_excited
-            self._curves[entity_path] = decimated_strips(
+            is_reliable = is_coherent if response_curve.values_of_complex else is_excited
+            self._curves[entity_path] = decimate_to_strips(
                 np.where(is_reliable, curve_values, np.nan)
             )
-            if response_curve.from_complex:
-                self._uncertain[entity_path] = decimated_strips(
+            if response_curve.values_of_complex:
+                self._uncertain[entity_path] = decimate_to_strips(
                     np.where(is_excited, curve_values, np.nan)
                 )
         excited_ends_hz = (
@@ -277,7 +279,7 @@ class ResponseCharts:
             else (HIGHEST_SHOWN_HZ, HIGHEST_SHOWN_HZ)
         )
         self._excited_hz = float(excited_ends_hz[0]), float(excited_ends_hz[1])
-        no_coherence_text = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
+        no_coherence_text = NO_COHERENCE_TEXT if estimate.final else NO_COHERENCE_YET_TEXT
         self._note = no_coherence_text if corrected_response.coherence is None else ""
 
     def draw(self, stream: "RecordingStream") -> None:
@@ -285,15 +287,17 @@ class ResponseCharts:
         stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
         for response_curve in self._response_curves:
             chart = response_curve.chart
-            if response_curve.from_complex:
+            if response_curve.values_of_complex:
                 # The whole curve lies beneath, so that there is no gap at a change of colour.
-                uncertain_curve = self._uncertain.get(chart.entity, ())
-                chart.draw_curve(stream, "uncertain", uncertain_curve, UNCERTAIN_ENTRY)
-            measured_curve = self._curves.get(chart.entity, ())
-            chart.draw_curve(stream, "measured", measured_curve, response_curve.key, curve_order=1)
-            ends_hz = (LOWEST_SHOWN_HZ, *self._excited_hz, HIGHEST_SHOWN_HZ)
+                uncertain_strips = self._uncertain.get(chart.entity, ())
+                chart.draw_curve(stream, "uncertain", uncertain_strips, UNCERTAIN_ENTRY)
+            measured_strips = self._curves.get(chart.entity, ())
+            chart.draw_curve(
+                stream, "measured", measured_strips, response_curve.legend_entry, curve_order=1
+            )
+            unexcited_band_ends_hz = (LOWEST_SHOWN_HZ, *self._excited_hz, HIGHEST_SHOWN_HZ)
             for name, first_hz, last_hz in zip(
-                _SHADE_NAMES, ends_hz[::2], ends_hz[1::2], strict=True
+                _SHADE_NAMES, unexcited_band_ends_hz[::2], unexcited_band_ends_hz[1::2], strict=True
             ):
                 chart.move_shade(stream, name, first_hz, last_hz)
         self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_ENTRY.color)
@@ -320,10 +324,10 @@ def _last_response_curves(
     decimation = response_decimation(last_response.frequency_hz)
     return {
         response_curve.chart.entity: decimation.strips(
-            response_curve.from_complex(last_response.response)
+            response_curve.values_of_complex(last_response.response)
         )
         for response_curve in response_curves
-        if response_curve.from_complex
+        if response_curve.values_of_complex
     }
 
 
@@ -358,7 +362,7 @@ def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
         _MAGNITUDE_TICK_STEP_DB * np.floor(lowest_db / _MAGNITUDE_TICK_STEP_DB),
         axis_end_db - _MAX_MAGNITUDE_RANGE_DB,
     )
-    tick_levels_db = steps(
+    tick_levels_db = round_ticks(
         axis_start_db,
         axis_end_db,
         max(1, round((axis_end_db - axis_start_db) / _MAGNITUDE_TICK_STEP_DB)),
@@ -390,16 +394,16 @@ def response_chart(
     *legend_entries
         Entries of the legend, in reading order.
     """
-    tick_values, grid_lines = decades(*band_hz)
-    frequency_axis = Axis("Frequency (Hz)", *band_hz, tick_values, grid_lines, logarithmic=True)
+    tick_values, grid_lines = decade_ticks(*band_hz)
+    frequency_axis = Axis("Frequency (Hz)", *band_hz, tick_values, grid_lines, is_logarithmic=True)
     return Chart(entity_path, *chart_size, frequency_axis, vertical_axis, legend_entries)
 
 
-def _chart(entity_path: str, vertical_axis: Axis, *legend_entries: LegendEntry) -> Chart:
+def _response_chart(entity_path: str, vertical_axis: Axis, *legend_entries: LegendEntry) -> Chart:
     """Return a chart of the frequency response, with "not estimated" in the legend if it fits."""
     chart_size = CHART_SIZES[entity_path]
     if (
-        LAST_SESSION_ENTRY not in legend_entries or chart_size[0] > _MAX_WIDTH_FOR_FOUR_ENTRIES
+        LAST_SESSION_ENTRY not in legend_entries or chart_size[0] > _MAX_FOUR_ENTRY_CHART_WIDTH_PT
     ):  # there is room for another entry
         legend_entries = (*legend_entries, NOT_ESTIMATED_ENTRY)
     return response_chart(
@@ -411,19 +415,19 @@ def _chart(entity_path: str, vertical_axis: Axis, *legend_entries: LegendEntry) 
 
 SPECTROGRAM_ENTITY: Final = "/spectrogram"
 """Entity path of the spectrogram in Rerun."""
-SIZE: Final = (1280.0, 677.0)
+SPECTROGRAM_CANVAS_SIZE: Final = (1280.0, 677.0)
 """Width and height of the spectrogram's canvas, in points."""
 
 LOWEST_DB, HIGHEST_DB = -80.0, 0.0
 """Levels at the lower and upper end of the colour scale, in dB re 1 N·m."""
-MAX_COLUMNS: Final = 300
+MAX_SPECTROGRAM_COLUMNS: Final = 300
 """Largest number of columns of the spectrogram.
 
 In longer sessions, a column shows the highest level of several time windows."""
 
-_COLOR_BAR_WIDTH = 28.0
+_COLOR_BAR_WIDTH_PT = 28.0
 """Width of the colour bar, in points."""
-_COLOR_BAR_MARGIN = 120.0
+_COLOR_BAR_MARGIN_PT = 120.0
 """Margin for the colour bar and its labels, in points."""
 
 
@@ -449,32 +453,42 @@ class SpectrogramChart:
         self, session: "SessionDescription", frequency_hz: RealArray, step_s: float
     ) -> None:
         duration_s = max(session.scheduled_ticks / session.rate_hz, step_s)
-        self._column_s = max(step_s, duration_s / MAX_COLUMNS)
+        self._column_s = max(step_s, duration_s / MAX_SPECTROGRAM_COLUMNS)
         column_count = int(np.ceil(duration_s / self._column_s))
-        end_s = column_count * self._column_s
+        time_axis_end_s = column_count * self._column_s
         half_bin_hz = float(frequency_hz[1] - frequency_hz[0]) / 2
-        end_hz = float(frequency_hz[-1]) + half_bin_hz
+        frequency_axis_end_hz = float(frequency_hz[-1]) + half_bin_hz
         self._lowest_hz = float(frequency_hz[1]) - half_bin_hz
-        canvas_width, canvas_height = SIZE
+        canvas_width, canvas_height = SPECTROGRAM_CANVAS_SIZE
         self.chart = Chart(
             SPECTROGRAM_ENTITY,
             canvas_width,
             canvas_height,
-            Axis("Time since the start of the session (s)", 0.0, end_s, steps(0.0, end_s, 15)),
-            Axis("Frequency (Hz)", 0.0, end_hz, steps(0.0, end_hz, 8)),
-            right=_COLOR_BAR_MARGIN,
+            Axis(
+                "Time since the start of the session (s)",
+                0.0,
+                time_axis_end_s,
+                round_ticks(0.0, time_axis_end_s, 15),
+            ),
+            Axis(
+                "Frequency (Hz)",
+                0.0,
+                frequency_axis_end_hz,
+                round_ticks(0.0, frequency_axis_end_hz, 8),
+            ),
+            right_margin=_COLOR_BAR_MARGIN_PT,
         )
         self._bar = Chart(
             f"{SPECTROGRAM_ENTITY}/bar",
             canvas_width,
             canvas_height,
             Axis("", 0.0, 1.0, ()),
-            Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, steps(LOWEST_DB, HIGHEST_DB, 8)),
-            left=canvas_width - _COLOR_BAR_WIDTH - 24.0,
+            Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, round_ticks(LOWEST_DB, HIGHEST_DB, 8)),
+            left_margin=canvas_width - _COLOR_BAR_WIDTH_PT - 24.0,
         )
         # Row 0 is at the top. The mean torque is omitted, because it is no motion.
         self._image = np.zeros((frequency_hz.size - 1, column_count), np.uint8)
-        self._filled = 0
+        self._filled_column_count = 0
         self._t_ns = 0
 
     @property
@@ -483,12 +497,12 @@ class SpectrogramChart:
 
         The first row belongs to the highest frequency.
         """
-        return self._image[:, : self._filled]
+        return self._image[:, : self._filled_column_count]
 
     def draw_frame(self, stream: "RecordingStream") -> None:
         """Send the static parts of the chart: the axes and the colour bar."""
         image_corners = self.chart.to_canvas(
-            [0.0, self.chart.x.last], [self._lowest_hz, self.chart.y.last]
+            [0.0, self.chart.x.end_value], [self._lowest_hz, self.chart.y.end_value]
         )
         _position_image(stream, f"{SPECTROGRAM_ENTITY}/levels", image_corners, self._image.shape)
         image_corners = self._bar.to_canvas([0.0, 1.0], [LOWEST_DB, HIGHEST_DB])
@@ -512,14 +526,14 @@ class SpectrogramChart:
         self._t_ns = t_ns
         for time_s, level_db in level_columns:
             column_index = min(max(int(time_s / self._column_s), 0), self._image.shape[1] - 1)
-            level_fraction = (level_db[:0:-1] - LOWEST_DB) / (HIGHEST_DB - LOWEST_DB)
-            byte_column = (255.0 * np.clip(level_fraction, 0.0, 1.0)).astype(np.uint8)
+            level_fractions = (level_db[:0:-1] - LOWEST_DB) / (HIGHEST_DB - LOWEST_DB)
+            byte_column = (255.0 * np.clip(level_fractions, 0.0, 1.0)).astype(np.uint8)
             np.maximum(self._image[:, column_index], byte_column, out=self._image[:, column_index])
-            self._filled = max(self._filled, column_index + 1)
+            self._filled_column_count = max(self._filled_column_count, column_index + 1)
 
     def draw(self, stream: "RecordingStream") -> None:
         """Send the columns of the spectrogram so far to Rerun."""
-        if self._filled:
+        if self._filled_column_count:
             stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
             _send_image(stream, f"{SPECTROGRAM_ENTITY}/levels", self.image)
 

@@ -61,7 +61,7 @@ class PlotCurve:
         Name in the legend, with its unit.
     color
         Colour of the line.
-    values
+    values_of_records
         Function from records (n,) to the curve's values (n,).
     width
         Width of the line, in points.
@@ -69,7 +69,7 @@ class PlotCurve:
 
     label: str
     color: Color
-    values: Callable[[Records], Values]
+    values_of_records: Callable[[Records], Values]
     width: float = 1.5
 
 
@@ -85,7 +85,7 @@ class Plot:
         Title of the axis, with its unit.
     curves
         Curves from the lowest to the topmost.
-    span
+    fixed_axis_range
         Ends of a fixed axis; None if the axis follows the values.
     min_span
         Least length of the axis in the unit of the curves, so that noise is not drawn as large as a
@@ -95,7 +95,7 @@ class Plot:
     component: str
     title: str
     curves: tuple[PlotCurve, ...]
-    span: tuple[float, float] | None = None
+    fixed_axis_range: tuple[float, float] | None = None
     min_span: float = 0.0
 
 
@@ -120,11 +120,11 @@ class PlotSource:
         """Entity path in Rerun of the invisible points that extend the plots' axes."""
         return f"{self.entity}/ticks"
 
-    def columns(self, records: Records) -> dict[str, Values]:
+    def values_by_component(self, records: Records) -> dict[str, Values]:
         """Return the values (n, curves) of each plot from records (n,), by component name."""
         return {
             plot.component: np.column_stack(
-                [plot_curve.values(records) for plot_curve in plot.curves]
+                [plot_curve.values_of_records(records) for plot_curve in plot.curves]
             )
             for plot in self.plots
         }
@@ -156,14 +156,14 @@ def send_columns(
         entity,
         [time_column],
         [
-            _column(component_name, component_values)
+            _component_column(component_name, component_values)
             for component_name, component_values in columns.items()
         ],
         strict=True,
     )
 
 
-def _column(component_name: str, component_values: Values) -> "ComponentColumn":
+def _component_column(component_name: str, component_values: Values) -> "ComponentColumn":
     """Return values (n, k) as a column of Rerun's data, with k scalars in each of n rows."""
     import rerun as rr
 
@@ -289,7 +289,7 @@ BUS_LOAD = Plot(
     "bus_load_percent",
     "Bus load (%)",
     (PlotCurve("bus load (%)", SKY_BLUE, lambda r: r["bus_load_percent"]),),
-    span=(0.0, 105.0),
+    fixed_axis_range=(0.0, 105.0),
 )
 """Plot of the load of the bus."""
 BUS_ERRORS = Plot(

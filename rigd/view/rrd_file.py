@@ -17,7 +17,7 @@ from rigd.errors import FailureError
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-SUFFIX: Final = ".rrd"
+RRD_SUFFIX: Final = ".rrd"
 """File name suffix by which Rerun's viewer recognises its files."""
 
 _RRD_FIRST_BYTES: Final = b"RRF"
@@ -69,7 +69,7 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
     from rigd.session import rename_without_replacing
     from rigd.view.plots import APPLICATION_ID
 
-    check_new(path)
+    check_new_rrd_file(path)
     temporary_path = path.with_name(f".rigd-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
     stream = rr.RecordingStream(APPLICATION_ID, recording_id=str(uuid.uuid4()))
     try:
@@ -86,9 +86,9 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
         temporary_path.unlink(missing_ok=True)
 
 
-def check_new(path: Path) -> None:
+def check_new_rrd_file(path: Path) -> None:
     """Raise RrdFileError if a path exists or does not have the suffix of a Rerun file."""
-    if path.suffix != SUFFIX:
+    if path.suffix != RRD_SUFFIX:
         raise RrdFileError(f"{path}: name the file ….rrd, which is how Rerun's viewer knows it.")
     try:
         path.lstat()
@@ -133,13 +133,13 @@ def _translate_write_errors(path: Path, temporary_path: Path) -> Iterator[None]:
     except OSError as error:
         raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
     except RuntimeError as error:  # from the SDK
-        number_match = _OS_ERROR_PATTERN.search(str(error))
-        cause = (
-            os.strerror(int(number_match[1]))
-            if number_match
+        error_number_match = _OS_ERROR_PATTERN.search(str(error))
+        failure_cause = (
+            os.strerror(int(error_number_match[1]))
+            if error_number_match
             else _reason_of_write_failure(temporary_path)
         )
-        raise RrdFileError(f"{path} cannot be written: {cause}.") from None
+        raise RrdFileError(f"{path} cannot be written: {failure_cause}.") from None
 
 
 def _reason_of_write_failure(temporary_path: Path) -> str:

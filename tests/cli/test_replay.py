@@ -138,7 +138,7 @@ def test_frequency_response_grows_with_the_sweep(chirp_recording):
     session, found, _ = chirp_recording
     chart = ResponseCharts(describe_recorded_session(session)).chart(MAGNITUDE_ENTITY)
     left, _, right, _ = chart.frame_edges
-    first_hz, last_hz = chart.x.first, chart.x.last
+    first_hz, last_hz = chart.x.start_value, chart.x.end_value
     drawn = rows(found[f"{MAGNITUDE_ENTITY}/measured"], "LineStrips2D:strips")
     assert len({t_ns for t_ns, _ in drawn}) > 15  # once a second
     for time_s, least_hz, most_hz in ((0.5, 0.0, 0.0), (8.5, 17.0, 19.0), (15.5, 34.5, 36.5)):
@@ -161,9 +161,9 @@ def test_last_frequency_response_is_that_of_analyze(chirp_recording):
     *_, (_, strips) = rows(found[f"{MAGNITUDE_ENTITY}/uncertain"], "LineStrips2D:strips")
     points = np.concatenate([np.asarray(strip, dtype=np.float64) for strip in strips])
     fraction = (points[:, 0] - left) / (right - left)
-    frequency_hz = chart.x.first * (chart.x.last / chart.x.first) ** fraction
+    frequency_hz = chart.x.start_value * (chart.x.end_value / chart.x.start_value) ** fraction
     level = (bottom - points[:, 1]) / (bottom - top)
-    measured_db = chart.y.first + level * (chart.y.last - chart.y.first)
+    measured_db = chart.y.start_value + level * (chart.y.end_value - chart.y.start_value)
     reference, _ = estimate(load_record(session.path), WelchSettings())
     inside = (frequency_hz > 0.6) & (frequency_hz < 49.9) & (level > 1e-3) & (level < 1 - 1e-3)
     assert inside.sum() > 250

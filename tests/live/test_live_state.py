@@ -20,7 +20,7 @@ from rigd.view.banner import (
     STOPPING,
     SUPERVISOR_SILENT,
     SUPERVISOR_SILENT_TORQUE_OFF,
-    preparing,
+    preparing_state,
 )
 from rigd.view.frequency_charts import LastResponse
 
@@ -39,10 +39,10 @@ def test_every_state_of_a_session_in_the_shared_state(channels):
         shared_state.beat(StateField.SUPERVISOR_BEAT)
         return states.read(0.0)
 
-    assert state(PHASE=Phase.OFF) == preparing()
-    assert state(PHASE=Phase.TARING) == preparing("Taring.")
-    assert state(PHASE=Phase.WAITING) == preparing("Waiting for the beam to rest.")
-    assert state(PHASE=Phase.READY, RECORD_MAY_START=1) == preparing("Ready.")
+    assert state(PHASE=Phase.OFF) == preparing_state()
+    assert state(PHASE=Phase.TARING) == preparing_state("Taring.")
+    assert state(PHASE=Phase.WAITING) == preparing_state("Waiting for the beam to rest.")
+    assert state(PHASE=Phase.READY, RECORD_MAY_START=1) == preparing_state("Ready.")
     assert state(PHASE=Phase.RUNNING) == RUNNING
     assert state(STOP_REASON=StopReason.OPERATOR) == STOPPING
     assert state(STOP_REASON=StopReason.NONE, PHASE=Phase.RETURNING) == RETURNING
@@ -68,7 +68,7 @@ def test_hanging_supervisor_is_reported_within_a_second(channels):
         state = states.read(now_s)
     assert state == SUPERVISOR_SILENT_TORQUE_OFF
     shared_state[StateField.RECORD_MAY_START] = 0  # before a record the supervisor may be silent
-    assert states.read(now_s + PERIOD_S) == preparing()
+    assert states.read(now_s + PERIOD_S) == preparing_state()
 
 
 def words(columns) -> list[str]:

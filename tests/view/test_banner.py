@@ -13,14 +13,14 @@ from rigd.view.banner import (
     STATE_ENTITY,
     SUPERVISOR_LOST,
     banner,
-    ended,
+    ended_state,
     gauge_color,
     gauge_text,
-    preparing,
+    preparing_state,
 )
 from rigd.view.plots import GREEN, GREY, ORANGE, RED, SKY_BLUE
 
-FAULT = ended("fault", "The disk is full.")
+FAULT = ended_state("fault", "The disk is full.")
 
 
 @pytest.fixture
@@ -57,9 +57,12 @@ def test_an_overloaded_computer_is_named(sweep):
 @pytest.mark.parametrize(
     ("state", "heading"),
     [
-        (preparing("Taring."), "# PREPARING\n\nTaring."),
-        (ended("complete", ""), "# COMPLETE\n\n**chirp**"),
-        (ended("stopped", "Stopped by the operator."), "# STOPPED\n\nStopped by the operator."),
+        (preparing_state("Taring."), "# PREPARING\n\nTaring."),
+        (ended_state("complete", ""), "# COMPLETE\n\n**chirp**"),
+        (
+            ended_state("stopped", "Stopped by the operator."),
+            "# STOPPED\n\nStopped by the operator.",
+        ),
         (FAULT, "# FAULT\n\n**The disk is full.**"),
         (SUPERVISOR_LOST, "# SUPERVISOR LOST\n\n**The supervising process ended."),
     ],
@@ -68,7 +71,7 @@ def test_every_state_shows_its_name_and_reason(sweep, state, heading):
     text = banner(sweep, state, 30_000_000_000, Health())
     assert text.startswith(heading)
     assert "left" not in text.split("\n")[0]
-    if state.over:
+    if state.is_over:
         assert "now" not in text
 
 

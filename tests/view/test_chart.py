@@ -5,27 +5,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.view.chart import Axis, Chart, LegendEntry, decades, steps, tick_text
+from rigd.view.chart import Axis, Chart, LegendEntry, decade_ticks, round_ticks, tick_text
 from rigd.view.plots import SKY_BLUE, TIMELINE
 
 AXIS_ENDS = st.tuples(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3), st.integers(1, 12))
 
 
 def axes(logarithmic: bool):
-    """Axes as the charts make them, with ticks of `decades` or `steps`."""
+    """Axes as the charts make them, with ticks of `decade_ticks` or `round_ticks`."""
     if logarithmic:
         return st.tuples(st.floats(1e-3, 1e3), st.floats(1.5, 1e5)).map(
             lambda ends: Axis(
                 "Frequency (Hz)",
                 ends[0],
                 ends[0] * ends[1],
-                *decades(ends[0], ends[0] * ends[1]),
-                logarithmic=True,
+                *decade_ticks(ends[0], ends[0] * ends[1]),
+                is_logarithmic=True,
             )
         )
     return AXIS_ENDS.map(
         lambda ends: Axis(
-            "Level (dB)", ends[0], ends[0] + ends[1], steps(ends[0], ends[0] + ends[1], ends[2])
+            "Level (dB)",
+            ends[0],
+            ends[0] + ends[1],
+            round_ticks(ends[0], ends[0] + ends[1], ends[2]),
         )
     )
 
@@ -43,19 +46,19 @@ def test_tick_labels_are_at_their_values(x, y, width, height):
     assert len(labels) == len(x.ticks) + len(y.ticks)
     for text, across, down in labels[: len(x.ticks)]:
         value = float(text.replace("−", "-"))
-        assert chart.to_canvas(value, y.first)[0] == pytest.approx(across, abs=0.01 * width)
+        assert chart.to_canvas(value, y.start_value)[0] == pytest.approx(across, abs=0.01 * width)
         assert left - 1e-6 <= across <= right + 1e-6
         assert down > bottom
     for text, across, down in labels[len(x.ticks) :]:
         value = float(text.replace("−", "-"))
-        assert chart.to_canvas(x.first, value)[1] == pytest.approx(down, abs=0.01 * height)
+        assert chart.to_canvas(x.start_value, value)[1] == pytest.approx(down, abs=0.01 * height)
         assert top - 1e-6 <= down <= bottom + 1e-6
         assert across < left
 
 
 @given(axes(True), st.lists(st.floats(0.0, 1.0), min_size=2, max_size=9))
 def test_equal_ratios_have_equal_lengths(axis, fractions):
-    values = axis.first * (axis.last / axis.first) ** np.array(fractions)
+    values = axis.start_value * (axis.end_value / axis.start_value) ** np.array(fractions)
     assert axis.fraction(values) == pytest.approx(fractions, abs=1e-9)
 
 
@@ -72,16 +75,16 @@ def test_vertical_axis_points_upwards():
 
 
 def test_ticks_are_round():
-    assert decades(0.5, 60.0)[0] == (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-    assert steps(0.0, 136.0, 15) == tuple(range(0, 140, 10))
-    assert str(steps(0.0, 136.0, 15)[0]) == "0.0"  # which equals -0.0
-    assert steps(-60.0, 40.0, 5) == (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0)
+    assert decade_ticks(0.5, 60.0)[0] == (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+    assert round_ticks(0.0, 136.0, 15) == tuple(range(0, 140, 10))
+    assert str(round_ticks(0.0, 136.0, 15)[0]) == "0.0"  # which equals -0.0
+    assert round_ticks(-60.0, 40.0, 5) == (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0)
     assert tick_text(-0.0) == "0"
     assert tick_text(-20.0) == "−20"
 
 
 def test_curves_are_at_their_stated_positions(shown):
-    axis = Axis("Frequency (Hz)", 1.0, 100.0, (1.0, 10.0, 100.0), logarithmic=True)
+    axis = Axis("Frequency (Hz)", 1.0, 100.0, (1.0, 10.0, 100.0), is_logarithmic=True)
     key = LegendEntry("measured", SKY_BLUE, width=3.0)
     chart = Chart("/c", 800.0, 400.0, axis, Axis("Level (dB)", 0.0, 1.0, (0.0, 1.0)), (key,))
     left, top, right, bottom = chart.frame_edges

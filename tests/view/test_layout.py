@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from rigd.view import Scene, plots
+from rigd.view.banner import GAUGES_CANVAS_SIZE as VALUES_SIZE
 from rigd.view.banner import GAUGES_ENTITY
-from rigd.view.banner import GAUGES_SIZE as VALUES_SIZE
 from rigd.view.frequency_charts import CHART_SIZES
 from rigd.view.plots import TIMELINE
 

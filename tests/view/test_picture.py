@@ -68,7 +68,7 @@ def test_final_response_is_that_of_the_analyser(path, record, shown):
     assert 300 < inside.sum() <= 400
     nearest = abs(at[:, 0] - points[inside, :1]).argmin(axis=1)
     _, top, _, bottom = chart.frame_edges
-    decibels = (chart.y.last - chart.y.first) / (bottom - top)
+    decibels = (chart.y.end_value - chart.y.start_value) / (bottom - top)
     one_percent_db = 20 * np.log10(1.01)
     assert np.all(abs(at[nearest, 1] - points[inside, 1]) * decibels < one_percent_db)
     # All of the excited band is shown, and the peaks to their tops.

@@ -27,7 +27,7 @@ def test_signals_have_the_unit_their_name_ends_in(make_samples):
         lateness_ns=[40_000, 0, 1_000_000],
         work_ns=200_000,
     )  # fmt: skip
-    shown = SIGNALS.columns(samples)
+    shown = SIGNALS.values_by_component(samples)
     assert shown["angle_mrad"] == pytest.approx(np.array([[25.0, 24.0], [0.0, 0.0], [-1.0, 1.0]]))
     assert shown["tracking_error_mrad"][:, 0] == pytest.approx([1.0, 0.0, -2.0])
     assert shown["coupling_torque_nm"][:, 0] == pytest.approx([0.5, -0.5, 0.0])
@@ -41,7 +41,7 @@ def test_signals_have_the_unit_their_name_ends_in(make_samples):
 
 
 def test_ages_have_the_unit_their_name_ends_in(make_timings):
-    shown = READINGS.columns(make_timings(2, angle_age_s=1e-3, wrench_age_s=2.5e-4))
+    shown = READINGS.values_by_component(make_timings(2, angle_age_s=1e-3, wrench_age_s=2.5e-4))
     assert shown["ages_ms"] == pytest.approx(np.array([[1.0, 0.25]] * 2))
 
 
@@ -108,7 +108,7 @@ def test_colours_differ_and_contrast_with_the_background(plot):
 
 def test_rerun_gets_the_columns_at_the_time_of_the_session(shown, make_samples):
     samples = make_samples(50, first_tick=100, angle_rad=np.linspace(-1e-3, 1e-3, 50))
-    expected = SIGNALS.columns(samples)
+    expected = SIGNALS.values_by_component(samples)
     found = shown([lambda stream: send_columns(stream, "/signals", samples["t_ns"], expected)])
     signals = found["/signals"]
     assert signals.batches == 1

@@ -74,10 +74,10 @@ def test_measured_response_lies_on_its_model(description, shown, delays_s, tool_
             s = 2j * np.pi * frequency_hz
             exact = transfer(s, description.beam, description.damping) + tool_inertia_kg_m2 * s * s
             axis = charts.chart(entity).y
-            expected = np.clip(of(exact), axis.first, axis.last)
+            expected = np.clip(of(exact), axis.start_value, axis.end_value)
             # Read off a canvas, at a frequency read off a canvas: where it is steep, not so well.
-            assert np.median(abs(seen - expected)) < 1e-3 * (axis.last - axis.first)
-            assert np.mean(abs(seen - expected) < 5e-3 * (axis.last - axis.first)) > 0.97
+            assert np.median(abs(seen - expected)) < 1e-3 * (axis.end_value - axis.start_value)
+            assert np.mean(abs(seen - expected) < 5e-3 * (axis.end_value - axis.start_value)) > 0.97
     (strip,) = strips(found[f"{COHERENCE_ENTITY}/measured"])
     assert values(charts, COHERENCE_ENTITY, strip)[1] == pytest.approx(
         np.full(len(strip), 0.9), abs=1e-5
@@ -96,8 +96,8 @@ def test_peaks_of_the_model_are_drawn_at_their_height(description, shown):
         peak_db = exact_db[(fine_hz > first_hz) & (fine_hz < last_hz)].max()
         assert seen[near].max() == pytest.approx(peak_db, abs=0.2)
     axis = charts.chart(MAGNITUDE_ENTITY).y
-    assert axis.first <= exact_db.min()
-    assert axis.last > exact_db.max()
+    assert axis.start_value <= exact_db.min()
+    assert axis.end_value > exact_db.max()
 
 
 def test_band_not_yet_excited_is_shaded_and_empty(description, shown):
@@ -108,7 +108,7 @@ def test_band_not_yet_excited_is_shaded_and_empty(description, shown):
     after = shown([charts.draw])
     chart = charts.chart(MAGNITUDE_ENTITY)
     left, _, right, _ = chart.frame_edges
-    at_20_hz = chart.to_canvas(20.0, chart.y.first)[0]
+    at_20_hz = chart.to_canvas(20.0, chart.y.start_value)[0]
 
     def shaded(found, name) -> tuple[float, float]:
         shade = found[f"{MAGNITUDE_ENTITY}/not_estimated_{name}"]

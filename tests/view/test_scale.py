@@ -73,7 +73,7 @@ def test_axes_always_hold_two_labels(make_samples, shown):
     drawings = scale.initial_drawings()
     for i in range(0, n, BLOCK):
         block = samples[i : i + BLOCK]
-        drawings += scale.tick_drawings(block["t_ns"], SIGNALS.columns(block))
+        drawings += scale.tick_drawings(block["t_ns"], SIGNALS.values_by_component(block))
     view = view_of(COUPLING_TORQUE, CLOSE_UP_WINDOW_S)
     ticks = shown(drawings)[SIGNALS.tick_entity]
     tick_ns = np.array(ticks.times_ns[view.tick_component])
@@ -116,7 +116,7 @@ def test_scale_does_not_depend_on_blocks(make_samples, shown):
         drawings = []
         for i in range(0, len(samples), block):
             part = samples[i : i + block]
-            drawings += scale.tick_drawings(part["t_ns"], SIGNALS.columns(part))
+            drawings += scale.tick_drawings(part["t_ns"], SIGNALS.values_by_component(part))
         name = view_of(COUPLING_TORQUE, CLOSE_UP_WINDOW_S).tick_component
         found = shown(drawings)[SIGNALS.tick_entity]
         return found.times_ns[name], found.values[name]
@@ -134,7 +134,7 @@ def test_every_view_gets_its_ticks_immediately(shown):
     found = shown(drawings)
     for view in TIME_VIEWS:
         assert (view.tick_component in found[view.source.tick_entity].values) == (
-            view.plot.span is None
+            view.plot.fixed_axis_range is None
         )
 
 
@@ -142,9 +142,9 @@ def test_invalid_values_are_skipped(make_samples):
     scale = AxisTickPoints(SIGNALS, TIME_VIEWS)
     for value in (np.nan, np.inf, 1.7e308, -1.7e308):
         samples = make_samples(200, coupling_torque_nm=value)
-        scale.tick_drawings(samples["t_ns"], SIGNALS.columns(samples))
+        scale.tick_drawings(samples["t_ns"], SIGNALS.values_by_component(samples))
     loop = make_samples(300, first_tick=200, work_ns=60_000)
     loop["t_ns"][150:] += 2**61  # another program's file
     loop["work_ns"][-1] = 0
-    assert scale.tick_drawings(loop["t_ns"], SIGNALS.columns(loop))
+    assert scale.tick_drawings(loop["t_ns"], SIGNALS.values_by_component(loop))
     assert view_of(LOOP, 10.0).height_pt < 150

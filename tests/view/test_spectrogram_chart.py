@@ -7,7 +7,7 @@ from rigd.spectral import RunningSpectrogram
 from rigd.view.frequency_charts import (
     HIGHEST_DB,
     LOWEST_DB,
-    MAX_COLUMNS,
+    MAX_SPECTROGRAM_COLUMNS,
     SPECTROGRAM_ENTITY,
     SpectrogramChart,
 )
@@ -84,5 +84,5 @@ def test_a_long_session_has_no_larger_image(description):
     chart = SpectrogramChart(hour, spectrogram.frequency_hz, STEP_S)
     levels = np.full(spectrogram.frequency_hz.size, -40.0)
     chart.update(0, [(t_s, levels) for t_s in np.arange(0.5, 3600.0, STEP_S)])
-    assert chart.image.shape[1] == MAX_COLUMNS
+    assert chart.image.shape[1] == MAX_SPECTROGRAM_COLUMNS
     assert np.all(chart.image == chart.image[0, 0])
