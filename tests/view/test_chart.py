@@ -59,7 +59,7 @@ def test_tick_labels_are_at_their_values(x, y, width, height):
 @given(axes(True), st.lists(st.floats(0.0, 1.0), min_size=2, max_size=9))
 def test_equal_ratios_have_equal_lengths(axis, fractions):
     values = axis.start_value * (axis.end_value / axis.start_value) ** np.array(fractions)
-    assert axis.fraction(values) == pytest.approx(fractions, abs=1e-9)
+    assert axis.fractions_along(values) == pytest.approx(fractions, abs=1e-9)
 
 
 def test_vertical_axis_points_upwards():
