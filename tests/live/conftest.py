@@ -416,7 +416,7 @@ def received(rerun_program, tmp_path_factory):
         producer = Producer(capacity=64_000)
         stack.callback(producer.close)
         producer.start()
-        publisher = Publisher(producer, first=f"{long_timeout}; p._MAX_ORPHANED_S = 0.5")
+        publisher = Publisher(producer, first=f"{long_timeout}; p._MAX_ORPHANED_SESSION_S = 0.5")
         stack.callback(publisher.close)
         publisher.begin()
         path = tmp_path_factory.mktemp("received") / "sessions.rrd"

@@ -259,7 +259,7 @@ def test_killed_frozen_server_is_replaced(start_producer, start_publisher, recei
 
 
 def test_server_is_replaced_after_a_kill_or_many_sessions(start_publisher, receive, own_port):
-    publisher = start_publisher(first=f"{own_port}; outlet._MAX_SESSIONS = 2")
+    publisher = start_publisher(first=f"{own_port}; outlet._MAX_SESSIONS_PER_SERVER = 2")
     first = publisher.address
     begins = tuple(ring.written_count for ring in publisher.producer.channels.rings)
     for name in ("second", "third"):
