@@ -160,9 +160,9 @@ def test_rate_filter_and_bias_are_set_and_read_back(connect):
 
 
 def test_a_value_that_the_box_does_not_take_is_refused(connect, monkeypatch):
-    get = SimulatedBox.get
+    get_page = SimulatedBox.get_page
     monkeypatch.setattr(
-        SimulatedBox, "get", lambda box, path: "" if "?" in path else get(box, path)
+        SimulatedBox, "get_page", lambda box, path: "" if "?" in path else get_page(box, path)
     )
     with pytest.raises(DeviceError, match='setuserfilter is "5", but 0 was set'):
         connect({"setuserfilter": "5"})
