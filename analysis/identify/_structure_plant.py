@@ -98,7 +98,7 @@ class StructurePlant(Plant):
         self,
         mode_count: int,  # noqa: ARG002 - that of `decay_poles`
         wrt: Sequence[str] = (),
-        near_rad_s: Sequence[complex] = (),  # noqa: ARG002 - nothing is searched
+        expected_rad_s: Sequence[complex] = (),  # noqa: ARG002 - nothing is searched
     ) -> tuple[Pole, ...]:
         """Return `decay_poles`, with derivatives of 0 by the parameters `wrt`."""
         zero_derivative = np.zeros(len(wrt), dtype=np.complex128)

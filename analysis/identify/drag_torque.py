@@ -197,7 +197,7 @@ class DragResponse:
         self._transform = CausalTransform.for_record(angle_rad.size, rate_hz)
         self.s = s = self._transform.s
         beam, damping = plant.beam, plant.damping
-        self._grid = DragGrid.of(beam, DRAG_MODES, DRAG_POINTS)
+        self._grid = DragGrid.along_beam(beam, DRAG_MODES, DRAG_POINTS)
         k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
         log_s, inertia = np.log(s), beam.density_over_stiffness * s * s
         p = inertia + damping.gamma * np.exp(damping.lambda_ * log_s)
@@ -227,7 +227,7 @@ class DragResponse:
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._torque_channel = plant.channel_response(s)
         angle_transform = self._transform.forward(angle_rad)
-        self._modal_speed_by_angle = -self._grid.leverage_m[:, None] * (
+        self._modal_speed_by_angle = -self._grid.shape_moment_m[:, None] * (
             self._inertial_response * s * angle_transform
         )
         self._speed_transform = s * angle_transform
@@ -343,14 +343,14 @@ class DragResponse:
     @property
     def _leverage(self) -> RealArray:
         """Return ``L b_i`` in m², the first moment of the shape of each mode i about the root."""
-        return self.plant.beam.length_m * self._grid.leverage_m
+        return self.plant.beam.length_m * self._grid.shape_moment_m
 
     def _mean_speed(self, speed_m_s: RealArray) -> float:
         """Return the mean speed of the beam in m/s, weighted with the power dissipated by drag."""
         speed_cubed = np.abs(speed_m_s) ** 3
-        total_power = float(speed_cubed.sum(axis=0) @ self._grid.weight_m)
+        total_power = float(speed_cubed.sum(axis=0) @ self._grid.quadrature_weight_m)
         speed_times_power = float(
-            np.einsum("tg,tg->g", speed_cubed, np.abs(speed_m_s)) @ self._grid.weight_m
+            np.einsum("tg,tg->g", speed_cubed, np.abs(speed_m_s)) @ self._grid.quadrature_weight_m
         )
         return speed_times_power / total_power if total_power > 0 else 0.0
 
@@ -383,7 +383,7 @@ class DragResponse:
         """
         speed_per_state, state_transition, state_per_modal_force = self._time_step_matrices()
         step_matrix = np.concatenate([self._grid.shapes.T @ speed_per_state, state_transition])
-        state_per_force = state_per_modal_force @ self._grid.to_modes
+        state_per_force = state_per_modal_force @ self._grid.modal_force_matrix
         modal_state, force_per_m, speed_magnitude = (
             np.zeros(len(state_transition)),
             *np.zeros((2, DRAG_POINTS)),
@@ -527,7 +527,7 @@ class DragResponse:
 
         Its last row gives the moment about the root.
         """
-        return np.vstack([self._grid.to_modes, self._grid.to_moment])
+        return np.vstack([self._grid.modal_force_matrix, self._grid.moment_weights_m2])
 
     def _modal_forces(self, point_force: RealArray) -> RealArray:
         """Convert forces at the beam points to modal forces and, last, the moment about the root.

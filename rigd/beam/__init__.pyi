@@ -15,8 +15,8 @@ from ._model import transfer as transfer
 from ._model import transfer_and_gradient as transfer_and_gradient
 from ._modes import Mode as Mode
 from ._modes import clamped_free_eigenvalues as clamped_free_eigenvalues
-from ._modes import mode_mean as mode_mean
 from ._modes import mode_shape as mode_shape
+from ._modes import mode_shape_mean as mode_shape_mean
 from ._modes import modes as modes
 from ._modes import participation as participation
 from ._modes import poles as poles

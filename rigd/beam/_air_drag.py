@@ -36,15 +36,15 @@ class DragGrid:
 
     x_m: RealArray
     """Distance of each point from the motor's axis, shape (g,)."""
-    weight_m: RealArray
+    quadrature_weight_m: RealArray
     """Quadrature weight of each point, a length of beam, shape (g,)."""
     shapes: RealArray
     """Mode shapes at the points, shape (n, g), each of mean square 1 over the beam."""
-    leverage_m: RealArray
+    shape_moment_m: RealArray
     """First moment ``b_i = ∫ x phi_i dx / L`` of each mode shape phi_i, shape (n,)."""
 
     @classmethod
-    def of(cls, beam: Beam, modes: int, points: int) -> "DragGrid":
+    def along_beam(cls, beam: Beam, modes: int, points: int) -> "DragGrid":
         """Return a grid of Gauss-Legendre points along a beam.
 
         Parameters
@@ -58,28 +58,30 @@ class DragGrid:
             the speed changes its sign along the beam.
         """
         nodes, point_weights = np.polynomial.legendre.leggauss(points)
-        x = 0.5 * (nodes + 1)
+        x_over_length = 0.5 * (nodes + 1)
         mode_numbers = np.arange(1, modes + 1)
         z = clamped_free_eigenvalues(modes)
         return cls(
-            x_m=beam.length_m * x,
-            weight_m=0.5 * beam.length_m * point_weights,
-            shapes=np.array([mode_shape(int(mode_number), x) for mode_number in mode_numbers]),
-            leverage_m=2 * beam.length_m * (-1.0) ** (mode_numbers - 1) / z**2,
+            x_m=beam.length_m * x_over_length,
+            quadrature_weight_m=0.5 * beam.length_m * point_weights,
+            shapes=np.array(
+                [mode_shape(int(mode_number), x_over_length) for mode_number in mode_numbers]
+            ),
+            shape_moment_m=2 * beam.length_m * (-1.0) ** (mode_numbers - 1) / z**2,
         )
 
     @property
-    def to_modes(self) -> RealArray:
+    def modal_force_matrix(self) -> RealArray:
         """Matrix that converts force per metre at the points into modal forces, shape (n, g)."""
-        length_m = self.weight_m.sum()
-        modal_projection: RealArray = self.shapes * self.weight_m / length_m
+        length_m = self.quadrature_weight_m.sum()
+        modal_projection: RealArray = self.shapes * self.quadrature_weight_m / length_m
         return modal_projection
 
     @property
-    def to_moment(self) -> RealArray:
+    def moment_weights_m2(self) -> RealArray:
         """Weights in m², shape (g,), that turn the force per metre at the points into a moment.
 
         The moment is about the motor's axis.
         """
-        moment_row: RealArray = self.x_m * self.weight_m
-        return moment_row
+        moment_weights_m2: RealArray = self.x_m * self.quadrature_weight_m
+        return moment_weights_m2

@@ -29,8 +29,8 @@ def fast_transform_length(min_length: int) -> int:
     min_length
         Smallest length, at least 1.
     """
-    length_unit = 1 << max(0, min_length.bit_length() - 4)
-    return -(-min_length // length_unit) * length_unit
+    length_step = 1 << max(0, min_length.bit_length() - 4)
+    return -(-min_length // length_step) * length_step
 
 
 class CausalTransform:
@@ -114,25 +114,25 @@ class CausalTransform:
         return cls(next_fast_len(ceil(padding_ratio * sample_count)), rate_hz, decay_exponent)
 
     def forward(
-        self, values: RealArray, *, oversampling: int = 1, hold: bool = False
+        self, signals: RealArray, *, oversampling: int = 1, holds_last_value: bool = False
     ) -> ComplexArray:
         """Return the Laplace transform of signals, divided by the sampling period, shape (…, bins).
 
         Parameters
         ----------
-        values
+        signals
             Signals from the first sample on, shape (…, n).
         oversampling
             Number of values per sample.
-        hold
+        holds_last_value
             Whether the signals keep their last value after their end; otherwise they are zero.
         """
         padded_length = oversampling * self.length
-        if hold:
-            missing_count = padded_length - values.shape[-1]
-            values = np.concatenate([values, np.repeat(values[..., -1:], missing_count, -1)], -1)
-        damped_values = values * self._weight(-1, values.shape[-1], oversampling)
-        transform: ComplexArray = np.fft.rfft(damped_values, padded_length)[..., : self.s.size]
+        if holds_last_value:
+            missing_count = padded_length - signals.shape[-1]
+            signals = np.concatenate([signals, np.repeat(signals[..., -1:], missing_count, -1)], -1)
+        damped_signals = signals * self._exponential_weight(-1, signals.shape[-1], oversampling)
+        transform: ComplexArray = np.fft.rfft(damped_signals, padded_length)[..., : self.s.size]
         return transform if oversampling == 1 else transform / oversampling
 
     def inverse(
@@ -153,8 +153,10 @@ class CausalTransform:
             samples = slice(samples)
         if oversampling != 1:
             transform = oversampling * transform
-        damped_values = np.fft.irfft(transform, oversampling * self.length)[..., samples]
-        signals: RealArray = damped_values * self._weight(1, samples.stop, oversampling)[samples]
+        damped_signals = np.fft.irfft(transform, oversampling * self.length)[..., samples]
+        signals: RealArray = (
+            damped_signals * self._exponential_weight(1, samples.stop, oversampling)[samples]
+        )
         return signals
 
     def inverse_at(
@@ -187,23 +189,25 @@ class CausalTransform:
         signals *= np.exp(self.sigma_per_s * fine_indices / (oversampling * self.rate_hz))
         return signals
 
-    def convolve(self, values: RealArray, response: ComplexArray) -> RealArray:
+    def convolve(self, signals: RealArray, response: ComplexArray) -> RealArray:
         """Return the response of a linear system to signals, in the shape of the signals.
 
         Parameters
         ----------
-        values
+        signals
             Signals from the first sample on, shape (…, n).
         response
             Transfer function of the system at `s`.
         """
-        return self.inverse(self.forward(values) * response, values.shape[-1])
+        return self.inverse(self.forward(signals) * response, signals.shape[-1])
 
-    def _weight(self, sign: int, count: int, oversampling: int) -> RealArray:
-        """Return ``exp(sign sigma t)`` at the first `count` values, from a cache if possible."""
-        weight = self._weights.get((sign, oversampling))
-        if weight is None or weight.size < count:
-            time_s = np.arange(count) / (oversampling * self.rate_hz)
-            weight = np.exp(sign * self.sigma_per_s * time_s)
-            self._weights[sign, oversampling] = weight
-        return weight[:count]
+    def _exponential_weight(
+        self, exponent_sign: int, value_count: int, oversampling: int
+    ) -> RealArray:
+        """Return ``exp(exponent_sign sigma t)`` at the first values, from a cache if possible."""
+        exponential_weight = self._weights.get((exponent_sign, oversampling))
+        if exponential_weight is None or exponential_weight.size < value_count:
+            time_s = np.arange(value_count) / (oversampling * self.rate_hz)
+            exponential_weight = np.exp(exponent_sign * self.sigma_per_s * time_s)
+            self._weights[exponent_sign, oversampling] = exponential_weight
+        return exponential_weight[:value_count]

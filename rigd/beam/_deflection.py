@@ -29,7 +29,7 @@ ComplexArray = NDArray[np.complexfloating]
 _CHUNK_SAMPLES = 256
 """Number of samples processed at once; a table of as many powers of each pole is stored."""
 
-_MAX_FREQUENCY_FRACTION = 0.5
+_MAX_FREQUENCY_PER_RATE = 0.5
 """Highest modal frequency in use, as a fraction of the sampling rate: higher ones would alias."""
 
 _REAL_POLE_COUNT = 10
@@ -38,11 +38,11 @@ _REAL_POLE_COUNT = 10
 They range from `_SLOWEST_POLE_RAD_S` to the sampling rate."""
 _SLOWEST_POLE_RAD_S = 0.03
 """Slowest real pole in rad/s (magnitude)."""
-_LOWEST_FIT_HZ = 0.05
+_MIN_FIT_FREQUENCY_HZ = 0.05
 """Lowest frequency in Hz to which the real poles' weights are fitted."""
-_HIGHEST_FIT_FRACTION = 0.1
+_MAX_FIT_FREQUENCY_PER_RATE = 0.1
 """Highest frequency of the real poles' fit, as a fraction of the sampling rate."""
-_SMALL_RESPONSE = 0.01
+_RESPONSE_FLOOR = 0.01
 """Magnitude of H_i below which the fit minimises the absolute, not relative, error.
 
 It corresponds to deflections of a hundredth of the rigid motion."""
@@ -130,21 +130,23 @@ class DeflectionFilter:
         """
         if self._start_rad is None:
             self._start_rad = float(angle_rad[0])
-        turned_rad = angle_rad - self._start_rad
-        for chunk_start in range(0, turned_rad.size, _CHUNK_SAMPLES):
-            chunk_rad = turned_rad[chunk_start : chunk_start + _CHUNK_SAMPLES]
-            chunk_powers = self._powers[:, _CHUNK_SAMPLES - chunk_rad.size :]
-            self._state = chunk_powers[:, 0] * self._state + chunk_powers[:, 1:] @ chunk_rad
+        angle_change_rad = angle_rad - self._start_rad
+        for chunk_start in range(0, angle_change_rad.size, _CHUNK_SAMPLES):
+            chunk_rad = angle_change_rad[chunk_start : chunk_start + _CHUNK_SAMPLES]
+            pole_powers = self._powers[:, _CHUNK_SAMPLES - chunk_rad.size :]
+            self._state = pole_powers[:, 0] * self._state + pole_powers[:, 1:] @ chunk_rad
         deflection: RealArray = (
             self._scaled_shapes @ self._state
-        ).real + self._direct * turned_rad[-1]
+        ).real + self._direct * angle_change_rad[-1]
         return deflection
 
 
 def _usable_mode_count(pole_pairs: ComplexArray, rate_hz: float) -> int:
     """Return the number of modes, from the first on, slow enough for the sampling rate."""
-    below_limit = np.abs(pole_pairs[:, 0].imag) < 2 * np.pi * _MAX_FREQUENCY_FRACTION * rate_hz
-    is_usable = below_limit & ~np.isnan(pole_pairs[:, 0])
+    is_below_frequency_limit = (
+        np.abs(pole_pairs[:, 0].imag) < 2 * np.pi * _MAX_FREQUENCY_PER_RATE * rate_hz
+    )
+    is_usable = is_below_frequency_limit & ~np.isnan(pole_pairs[:, 0])
     return is_usable.size if is_usable.all() else int(np.argmin(is_usable))
 
 
@@ -153,9 +155,9 @@ def _branch_cut_poles(damping: Damping, rate_hz: float) -> RealArray:
 
     The array is empty if the damping is of integer order, which has no branch cut.
     """
-    internal_is_integer = damping.zeta == 0 or damping.alpha in (0, 1)
-    external_is_integer = damping.gamma == 0 or damping.lambda_ in (0, 1)
-    if internal_is_integer and external_is_integer:
+    internal_order_is_integer = damping.zeta == 0 or damping.alpha in (0, 1)
+    external_order_is_integer = damping.gamma == 0 or damping.lambda_ in (0, 1)
+    if internal_order_is_integer and external_order_is_integer:
         return np.zeros(0)
     poles: RealArray = -np.geomspace(_SLOWEST_POLE_RAD_S, rate_hz, _REAL_POLE_COUNT)
     return poles
@@ -175,20 +177,20 @@ def _modal_stiffness_terms(
     external_term = damping.gamma * s**damping.lambda_
     internal_term = damping.zeta * s**damping.alpha
     k_fourth = (z / beam.length_m) ** 4
-    log_slope = (
+    slope_by_log_s = (
         2 * inertial_term
         + damping.lambda_ * external_term
         + damping.alpha * internal_term * k_fourth
     )
-    return inertial_term + external_term, (1 + internal_term) * k_fourth, log_slope
+    return inertial_term + external_term, (1 + internal_term) * k_fourth, slope_by_log_s
 
 
 def _mode_residues(
     z: RealArray, pole_pairs: ComplexArray, beam: Beam, damping: Damping
 ) -> ComplexArray:
     """Return the residues in rad/s of each mode's response at its two poles, shape (modes, 2)."""
-    inertial_load, _, log_slope = _modal_stiffness_terms(pole_pairs, z[:, None], beam, damping)
-    residues: ComplexArray = inertial_load * pole_pairs / log_slope
+    inertial_load, _, slope_by_log_s = _modal_stiffness_terms(pole_pairs, z[:, None], beam, damping)
+    residues: ComplexArray = inertial_load * pole_pairs / slope_by_log_s
     return residues
 
 
@@ -206,25 +208,27 @@ def _branch_cut_weights(
     pairs with the given `pair_weights`.
     """
     frequency_hz = np.geomspace(
-        _LOWEST_FIT_HZ, max(_HIGHEST_FIT_FRACTION * rate_hz, 2 * _LOWEST_FIT_HZ), 200
+        _MIN_FIT_FREQUENCY_HZ,
+        max(_MAX_FIT_FREQUENCY_PER_RATE * rate_hz, 2 * _MIN_FIT_FREQUENCY_HZ),
+        200,
     )
     s = 2j * np.pi * frequency_hz[:, None]
     inertial_load, spring_term, _ = _modal_stiffness_terms(s, z, beam, damping)
     exact_response = inertial_load / (spring_term + inertial_load)
     pole_columns = 1 / (1 - pole_factors * np.exp(-s / rate_hz)) - _steady_states(pole_factors)
     fit_residual = exact_response - pole_columns @ pair_weights.T
-    cut_weights = np.empty((z.size, _REAL_POLE_COUNT))
+    branch_cut_weights = np.empty((z.size, _REAL_POLE_COUNT))
     for i in range(z.size):
-        point_weight = 1 / (np.abs(exact_response[:, i, None]) + _SMALL_RESPONSE)
+        point_weight = 1 / (np.abs(exact_response[:, i, None]) + _RESPONSE_FLOOR)
         equation_matrix, equation_target = (
             pole_columns[:, -_REAL_POLE_COUNT:] * point_weight,
             fit_residual[:, i, None] * point_weight,
         )
-        cut_weights[i] = np.linalg.lstsq(
+        branch_cut_weights[i] = np.linalg.lstsq(
             np.concatenate([equation_matrix.real, equation_matrix.imag]),
             np.concatenate([equation_target.real, equation_target.imag])[:, 0],
         )[0]
-    return cut_weights
+    return branch_cut_weights
 
 
 def _scaled_shapes(beam: Beam, x: RealArray, z: RealArray) -> RealArray:
@@ -239,7 +243,7 @@ def _scaled_shapes(beam: Beam, x: RealArray, z: RealArray) -> RealArray:
     for i, shape_factor in enumerate(shape_factors):
         shapes[:, i] = shape_factor * mode_shape(i + 1, x)
     if z.size:
-        under_load = x**2 * (x**3 - 10 * x + 20) / 120
-        shapes[:, -1] = z[-1] ** 4 * (under_load - shapes[:, :-1] @ z[:-1] ** -4.0)
+        static_deflection = x**2 * (x**3 - 10 * x + 20) / 120
+        shapes[:, -1] = z[-1] ** 4 * (static_deflection - shapes[:, :-1] @ z[:-1] ** -4.0)
     scaled_shapes: RealArray = beam.length_m * shapes
     return scaled_shapes

@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam._model import Beam, Damping
-from rigd.beam._modes import clamped_free_eigenvalues, mode_mean, mode_shape, poles_for_eigenvalues
+from rigd.beam._modes import (
+    clamped_free_eigenvalues,
+    mode_shape,
+    mode_shape_mean,
+    poles_for_eigenvalues,
+)
 from rigd.beam._point_force import PointForceGrid
 from rigd.beam.realisation import RealisationError
 
@@ -22,31 +27,31 @@ ComplexArray = NDArray[np.complexfloating]
 
 _MAX_MODES = 80
 """Largest number of modes in a realisation."""
-_HEAVY_DAMPING_RATIO = 0.9
+_MAX_MODAL_DAMPING_RATIO = 0.9
 """Damping ratio from which the real poles represent a mode.
 
 The mode's own poles lie on the branch cut, or near it."""
-_RESONANT_DAMPING_RATIO = 0.3
+_MAX_RESONANT_DAMPING_RATIO = 0.3
 """Damping ratio below which the last mode counts as resonant, like the omitted modes above it."""
 _SLOWEST_POLE_RAD_S = 0.03
 """Slowest real pole in rad/s (magnitude)."""
 _REAL_POLES_PER_DECADE = 5
 """Number of real poles per decade of frequency."""
-_HIGHEST_MODE_FACTOR = 2.0
+_HIGHEST_MODE_PER_BAND = 2.0
 """Multiple of the highest frequency of interest up to which modes are included.
 
 The omitted modes are static below the highest frequency."""
-_HIGHEST_REAL_POLE_FACTOR = 10.0
+_HIGHEST_REAL_POLE_PER_BAND = 10.0
 """Multiple of the highest frequency of interest up to which there are real poles."""
-_TAIL_END_FACTOR = 30.0
+_TAIL_END_PER_BAND = 30.0
 """Multiple of the highest frequency of interest up to which the fit bounds the response."""
-_TAIL_WEIGHT = 1e-2
+_FIT_TAIL_WEIGHT = 1e-2
 """Weight of the fit beyond the highest frequency, which bounds the response there.
 
 It applies on a line halfway between the axes, where no omitted mode resonates."""
-_POINTS_PER_DECADE = 40
+_FIT_POINTS_PER_DECADE = 40
 """Number of fitted frequencies per decade."""
-_SMALL_RESPONSE = 0.01
+_RESPONSE_FLOOR = 0.01
 """Size of a response below which the fit minimises its absolute, not relative, error.
 
 The responses are the torque per force, divided by the lever arm, and the shear per force."""
@@ -118,21 +123,23 @@ def realise_force(
     check_force_damping_order(damping)
     x = np.append(output_at_m, force_at_m) / beam.length_m
     poles, residues = _modal_poles_and_residues(beam, damping, x, highest_rad_s)
-    if poles.size == _MAX_MODES and -poles[-1].real < _RESONANT_DAMPING_RATIO * np.abs(poles[-1]):
+    if poles.size == _MAX_MODES and -poles[-1].real < _MAX_RESONANT_DAMPING_RATIO * np.abs(
+        poles[-1]
+    ):
         # The next modes resonate and are not included.
-        highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _HIGHEST_MODE_FACTOR)
+        highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _HIGHEST_MODE_PER_BAND)
 
     lowest_fit_rad_s, highest_fit_rad_s = _SLOWEST_POLE_RAD_S / 300, highest_rad_s
     s = 1j * np.geomspace(
         lowest_fit_rad_s,
         highest_fit_rad_s,
-        int(_POINTS_PER_DECADE * np.log10(highest_fit_rad_s / lowest_fit_rad_s)),
+        int(_FIT_POINTS_PER_DECADE * np.log10(highest_fit_rad_s / lowest_fit_rad_s)),
     )
     s = s[np.abs(s[:, None] - poles).min(axis=1, initial=np.inf) > 1e-6 * np.abs(s)]
     tail_rad_s = np.geomspace(
-        highest_fit_rad_s, _TAIL_END_FACTOR * highest_fit_rad_s, _POINTS_PER_DECADE
+        highest_fit_rad_s, _TAIL_END_PER_BAND * highest_fit_rad_s, _FIT_POINTS_PER_DECADE
     ) * np.exp(0.25j * np.pi)
-    fit_emphasis = np.append(np.ones(s.size), np.full(tail_rad_s.size, _TAIL_WEIGHT))
+    fit_emphasis = np.append(np.ones(s.size), np.full(tail_rad_s.size, _FIT_TAIL_WEIGHT))
     s = np.append(s, tail_rad_s)
     grid = PointForceGrid(s, beam, damping)
     exact_response = np.column_stack(
@@ -146,7 +153,7 @@ def realise_force(
     real_pole_count = (
         ceil(
             _REAL_POLES_PER_DECADE
-            * np.log10(_HIGHEST_REAL_POLE_FACTOR * highest_fit_rad_s / _SLOWEST_POLE_RAD_S)
+            * np.log10(_HIGHEST_REAL_POLE_PER_BAND * highest_fit_rad_s / _SLOWEST_POLE_RAD_S)
         )
         + 1
     )
@@ -157,8 +164,8 @@ def realise_force(
     error_weights = fit_emphasis[:, None] / np.column_stack(
         [
             np.abs(exact_response[:, :-2]) + _infinite_beam_response(s, beam, damping)[:, None],
-            np.abs(exact_response[:, -2]) + _SMALL_RESPONSE * force_at_m,
-            np.abs(exact_response[:, -1]) + _SMALL_RESPONSE,
+            np.abs(exact_response[:, -2]) + _RESPONSE_FLOOR * force_at_m,
+            np.abs(exact_response[:, -1]) + _RESPONSE_FLOOR,
         ]
     )
     remainder = exact_response - modal_response
@@ -174,24 +181,24 @@ def realise_force(
             rcond=_SINGULAR_VALUE_CUTOFF,
         )[0]
 
-    pair_states = 2 * poles.size
-    n = pair_states + real_poles.size
+    pair_state_count = 2 * poles.size
+    n = pair_state_count + real_poles.size
     a, b = np.zeros((n, n)), np.ones(n)
-    first_rows = np.arange(0, pair_states, 2)
-    a[first_rows, first_rows] = a[first_rows + 1, first_rows + 1] = poles.real
-    a[first_rows, first_rows + 1] = poles.imag
-    a[first_rows + 1, first_rows] = -poles.imag
-    b[first_rows + 1] = 0.0
-    real_rows = np.arange(pair_states, n)
-    a[real_rows, real_rows] = real_poles
-    b[real_rows] = -real_poles
+    pair_rows = np.arange(0, pair_state_count, 2)
+    a[pair_rows, pair_rows] = a[pair_rows + 1, pair_rows + 1] = poles.real
+    a[pair_rows, pair_rows + 1] = poles.imag
+    a[pair_rows + 1, pair_rows] = -poles.imag
+    b[pair_rows + 1] = 0.0
+    real_pole_rows = np.arange(pair_state_count, n)
+    a[real_pole_rows, real_pole_rows] = real_poles
+    b[real_pole_rows] = -real_poles
     output_rows = np.empty((exact_response.shape[1], n))
     # The first of a pair's states is the real part of z, the second minus its imaginary part.
-    output_rows[:, first_rows], output_rows[:, first_rows + 1] = (
+    output_rows[:, pair_rows], output_rows[:, pair_rows + 1] = (
         2 * residues.real,
         2 * residues.imag,
     )
-    output_rows[:, pair_states:] = fitted_weights[:, :-1]
+    output_rows[:, pair_state_count:] = fitted_weights[:, :-1]
     return ForceRealisation(a, poles.size, b, output_rows, fitted_weights[:, -1])
 
 
@@ -226,16 +233,16 @@ def _modal_poles_and_residues(
     z = clamped_free_eigenvalues(_MAX_MODES)
     poles = poles_for_eigenvalues(z, beam, damping)[:, 0]
     pole_magnitude = np.abs(poles)  # not a number where there is none: then False below
-    is_selected = (poles.imag > 0) & (-poles.real < _HEAVY_DAMPING_RATIO * pole_magnitude)
-    is_selected &= pole_magnitude < _HIGHEST_MODE_FACTOR * highest_rad_s
+    is_selected = (poles.imag > 0) & (-poles.real < _MAX_MODAL_DAMPING_RATIO * pole_magnitude)
+    is_selected &= pole_magnitude < _HIGHEST_MODE_PER_BAND * highest_rad_s
     poles, z = poles[is_selected], z[is_selected]
     mode_numbers = np.flatnonzero(is_selected) + 1
     mode_shapes = np.array(
         [mode_shape(int(mode_number), x) for mode_number in mode_numbers]
     ).reshape(-1, x.size)
     shape_sign = (-1.0) ** (mode_numbers - 1)
-    leverage_m = 2 * beam.length_m * shape_sign / z**2  # ∫ x phi dx / L
-    shape_mean = mode_mean(_MAX_MODES)[is_selected]
+    shape_moment_m = 2 * beam.length_m * shape_sign / z**2  # ∫ x phi dx / L
+    shape_mean = mode_shape_mean(_MAX_MODES)[is_selected]
 
     k_fourth = (z / beam.length_m) ** 4
     inertial_term = beam.density_over_stiffness * poles**2
@@ -245,12 +252,12 @@ def _modal_poles_and_residues(
         2 * inertial_term + damping.lambda_ * external_term + damping.alpha * internal_term
     ) / poles
     shape_at_force = mode_shapes[:, -1] / equation_slope
-    per_length = beam.length_m * beam.bending_stiffness_n_m2
+    length_times_stiffness = beam.length_m * beam.bending_stiffness_n_m2
     root_residue = shape_at_force * (inertial_term + external_term)
     residues: ComplexArray = np.vstack(
         [
-            mode_shapes[:, :-1].T * shape_at_force / per_length,
-            leverage_m * root_residue,
+            mode_shapes[:, :-1].T * shape_at_force / length_times_stiffness,
+            shape_moment_m * root_residue,
             shape_mean * root_residue,
         ]
     )

@@ -96,23 +96,26 @@ GRADIENT_NAMES = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness
 
 Each derivative holds the other five parameters constant."""
 
-_BLOCK_POINTS = 2048
+_FREQUENCIES_PER_BLOCK = 2048
 """Number of frequencies evaluated at once.
 
 Temporaries that fit into the cache and below malloc's trimming threshold make 8000 points twice as
 fast."""
 
-_SERIES_LIMIT = 40.0
+_MAX_SERIES_ARGUMENT = 40.0
 """Magnitude of q below which F is computed from its power series."""
-_SERIES = np.array(
+_SERIES_COEFFICIENTS = np.array(
     [
         [4.0 * (-4.0) ** k / factorial(4 * k + 3) for k in range(10)],
         [(-4.0) ** k / factorial(4 * k) + (k == 0) for k in range(10)],
     ]
 )
 """Power series coefficients of the numerator N(q) and the denominator D(q), lowest power first."""
-_SERIES_AND_DERIVATIVES = np.concatenate(
-    [_SERIES, np.pad(_SERIES[:, 1:] * np.arange(1.0, 10.0), ((0, 0), (0, 1)))]
+_SERIES_AND_SLOPE_COEFFICIENTS = np.concatenate(
+    [
+        _SERIES_COEFFICIENTS,
+        np.pad(_SERIES_COEFFICIENTS[:, 1:] * np.arange(1.0, 10.0), ((0, 0), (0, 1))),
+    ]
 )
 """Power series coefficients of N(q) and D(q), then of dN/dq and dD/dq, lowest power first."""
 
@@ -140,10 +143,11 @@ class TransferGrid:
         self._s_squared = s_points * s_points
         self._log_s = np.log(nonzero_s)
         # On the imaginary axis, where fits live, s^order is a real power times one constant phase.
-        on_axis = bool(np.all((nonzero_s.real == 0) & (nonzero_s.imag > 0)))
-        self._log_magnitude = np.log(nonzero_s.imag) if on_axis else None
+        is_on_imaginary_axis = bool(np.all((nonzero_s.real == 0) & (nonzero_s.imag > 0)))
+        self._log_magnitude = np.log(nonzero_s.imag) if is_on_imaginary_axis else None
         self._grid_slices = [
-            slice(i, i + _BLOCK_POINTS) for i in range(0, s_points.size, _BLOCK_POINTS)
+            slice(i, i + _FREQUENCIES_PER_BLOCK)
+            for i in range(0, s_points.size, _FREQUENCIES_PER_BLOCK)
         ]
 
     def evaluate(self, beam: Beam, damping: Damping) -> ComplexArray:
@@ -158,7 +162,9 @@ class TransferGrid:
         for grid_slice in self._grid_slices:
             c = 1 + damping.zeta * self._power_of_s(damping.alpha, grid_slice)
             s_lambda = self._power_of_s(damping.lambda_, grid_slice)
-            f = _evaluate_f(self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice))
+            f = _dimensionless_response(
+                self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice)
+            )
             np.multiply((-beam.bending_stiffness_n_m2 / beam.length_m) * c, f, out=g[grid_slice])
         return g.reshape(self.shape)
 
@@ -192,8 +198,8 @@ class TransferGrid:
             raise ValueError(
                 f"{sorted(unknown_names)} are not parameters of G: choose from {GRADIENT_NAMES}."
             )
-        per_length = -beam.bending_stiffness_n_m2 / beam.length_m
-        stiffness_volume = beam.bending_stiffness_n_m2 * beam.length_m**3
+        minus_stiffness_per_length = -beam.bending_stiffness_n_m2 / beam.length_m
+        stiffness_length_cubed = beam.bending_stiffness_n_m2 * beam.length_m**3
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         gradient = np.empty((len(wrt), g.size), dtype=np.complex128)
         for grid_slice in self._grid_slices:
@@ -201,10 +207,10 @@ class TransferGrid:
             s_lambda = self._power_of_s(damping.lambda_, grid_slice)
             c = 1 + damping.zeta * s_alpha
             q = self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice)
-            f, f_slope, remainder = _f_with_slope(q)
-            np.multiply(per_length * c, f, out=g[grid_slice])
-            internal_term = (per_length * s_alpha) * remainder
-            f_slope *= stiffness_volume
+            f, f_slope, remainder = _dimensionless_response_with_slope(q)
+            np.multiply(minus_stiffness_per_length * c, f, out=g[grid_slice])
+            internal_term = (minus_stiffness_per_length * s_alpha) * remainder
+            f_slope *= stiffness_length_cubed
             external_term = s_lambda * f_slope
             for row, parameter_name in zip(gradient[:, grid_slice], wrt, strict=True):
                 match parameter_name:
@@ -320,7 +326,7 @@ def transfer_and_gradient(
     return TransferGrid(s).evaluate_with_gradient(beam, damping, wrt)
 
 
-def _polynomials(coefficients: RealArray, x: ComplexArray) -> ComplexArray:
+def _evaluate_polynomials(coefficients: RealArray, x: ComplexArray) -> ComplexArray:
     """Return the values of k polynomials at n points, shape (k, n).
 
     `coefficients` have the shape (k, degree + 1), the lowest power first.
@@ -332,14 +338,14 @@ def _polynomials(coefficients: RealArray, x: ComplexArray) -> ComplexArray:
     return polynomial_sums
 
 
-def _scaled_form(q: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+def _response_at_large_q(q: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Return F(q) and ``2 z² sin z sinh z / (1 + cos z cosh z)`` at large ``q = z⁴``.
 
     Only decaying exponentials are used, so nothing overflows.
     """
     lower_half_plane = np.flatnonzero(q.imag < 0)
-    z_squared = _root_in_first_quadrant(q.real, np.abs(q.imag))
-    z = _root_in_first_quadrant(z_squared.real, z_squared.imag)
+    z_squared = _first_quadrant_square_root(q.real, np.abs(q.imag))
+    z = _first_quadrant_square_root(z_squared.real, z_squared.imag)
     decay = np.exp(-z)
     rotation = np.exp(1j * z)
     e = decay * rotation
@@ -360,7 +366,7 @@ def _scaled_form(q: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     return f, s
 
 
-def _root_in_first_quadrant(real: RealArray, imag: RealArray) -> ComplexArray:
+def _first_quadrant_square_root(real: RealArray, imag: RealArray) -> ComplexArray:
     """Return the square root of ``real + 1j imag`` for ``imag >= 0``.
 
     It is as accurate as numpy's and three times as fast.
@@ -375,26 +381,28 @@ def _root_in_first_quadrant(real: RealArray, imag: RealArray) -> ComplexArray:
     return complex_root
 
 
-def _evaluate_f(q: ComplexArray) -> ComplexArray:
+def _dimensionless_response(q: ComplexArray) -> ComplexArray:
     """Return the beam's dimensionless response function F(q) at ``q = z⁴``."""
     f = np.empty_like(q)
-    is_small = np.abs(q) < _SERIES_LIMIT
+    is_small = np.abs(q) < _MAX_SERIES_ARGUMENT
     if is_small.any():
         small_q = q[is_small]
-        n, d = _polynomials(_SERIES, small_q)
+        n, d = _evaluate_polynomials(_SERIES_COEFFICIENTS, small_q)
         f[is_small] = small_q * n / d
     is_large = ~is_small
-    f[is_large] = _scaled_form(q[is_large])[0]
+    f[is_large] = _response_at_large_q(q[is_large])[0]
     return f
 
 
-def _f_with_slope(q: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+def _dimensionless_response_with_slope(
+    q: ComplexArray,
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return the beam's response function F(q), dF/dq and ``F - q dF/dq``, without cancellation."""
     f, f_slope, remainder = np.empty((3, q.size), dtype=np.complex128)
-    is_small = np.abs(q) < _SERIES_LIMIT
+    is_small = np.abs(q) < _MAX_SERIES_ARGUMENT
     if is_small.any():
         small_q = q[is_small]
-        n, d, n_slope, d_slope = _polynomials(_SERIES_AND_DERIVATIVES, small_q)
+        n, d, n_slope, d_slope = _evaluate_polynomials(_SERIES_AND_SLOPE_COEFFICIENTS, small_q)
         wronskian = n * d_slope - n_slope * d
         d_squared = d * d
         f[is_small] = small_q * n / d
@@ -402,9 +410,9 @@ def _f_with_slope(q: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexA
         remainder[is_small] = small_q * small_q * wronskian / d_squared
     is_large = ~is_small
     large_q = q[is_large]
-    f_high, s_high = _scaled_form(large_q)
-    q_slope = 0.25 * (f_high * (1 + f_high) + s_high)
+    f_high, s_high = _response_at_large_q(large_q)
+    q_times_slope = 0.25 * (f_high * (1 + f_high) + s_high)
     f[is_large] = f_high
-    f_slope[is_large] = q_slope / large_q
-    remainder[is_large] = f_high - q_slope
+    f_slope[is_large] = q_times_slope / large_q
+    remainder[is_large] = f_high - q_times_slope
     return f, f_slope, remainder

@@ -52,8 +52,8 @@ class Mode:
     """Damping ratio of the mode, ``-(p_1 + p_2) / (2 sqrt(p_1 p_2))``; above 1 if over-damped."""
 
 
-def clamped_free_eigenvalues(n: int) -> RealArray:
-    """Return the first `n` positive roots z_i of ``1 + cos z cosh z = 0``, shape (n,).
+def clamped_free_eigenvalues(mode_count: int) -> RealArray:
+    """Return the first positive roots z_i of ``1 + cos z cosh z = 0``, shape (mode_count,).
 
     References
     ----------
@@ -65,33 +65,33 @@ def clamped_free_eigenvalues(n: int) -> RealArray:
     >>> print(clamped_free_eigenvalues(3).round(6))
     [1.875104 4.694091 7.854757]
     """
-    return _cached_eigenvalues(n).copy()
+    return _cached_eigenvalues(mode_count).copy()
 
 
 @cache
-def _cached_eigenvalues(n: int) -> RealArray:
-    """Return the first `n` clamped–free eigenvalues as a cached array that must not be changed."""
-    i = np.arange(1, n + 1)
+def _cached_eigenvalues(mode_count: int) -> RealArray:
+    """Return the first clamped–free eigenvalues as a cached array that must not be changed."""
+    i = np.arange(1, mode_count + 1)
     asymptotic_root = (i - 0.5) * np.pi
-    sign = np.where(i % 2 == 1, 1.0, -1.0)
+    sech_sign = np.where(i % 2 == 1, 1.0, -1.0)
     # With z = (i - 1/2) pi + d the equation is sin d = ±sech z: no growing term, small d.
-    d = np.zeros(n)
+    d = np.zeros(mode_count)
     for _ in range(8):
         decay = np.exp(-(asymptotic_root + d))
         sech = 2 * decay / (1 + decay * decay)
         tanh = (1 - decay * decay) / (1 + decay * decay)
-        d -= (np.sin(d) - sign * sech) / (np.cos(d) + sign * sech * tanh)
+        d -= (np.sin(d) - sech_sign * sech) / (np.cos(d) + sech_sign * sech * tanh)
     return asymptotic_root + d
 
 
-def undamped_frequencies_rad_s(beam: Beam, n: int) -> RealArray:
-    """Return the first `n` natural frequencies of the undamped beam, shape (n,), in rad/s.
+def undamped_frequencies_rad_s(beam: Beam, mode_count: int) -> RealArray:
+    """Return the first natural frequencies of the undamped beam in rad/s, shape (mode_count,).
 
     Parameters
     ----------
     beam
         Uniform beam on a locked hub.
-    n
+    mode_count
         Number of modes, from the first on.
 
     Examples
@@ -102,7 +102,7 @@ def undamped_frequencies_rad_s(beam: Beam, n: int) -> RealArray:
     >>> print((undamped_frequencies_rad_s(beam, 3) / (2 * np.pi)).round(3))
     [ 2.554 16.005 44.816]
     """
-    z = clamped_free_eigenvalues(n)
+    z = clamped_free_eigenvalues(mode_count)
     frequencies_rad_s: RealArray = z * z / (beam.length_m**2 * np.sqrt(beam.density_over_stiffness))
     return frequencies_rad_s
 
@@ -133,9 +133,9 @@ def mode_shape(mode_number: int, x_over_length: ArrayLike) -> RealArray:
     z = float(clamped_free_eigenvalues(mode_number)[-1])
     x = z * np.asarray(x_over_length, dtype=np.float64)
     cosine, sine, decay = np.cos(z), np.sin(z), np.exp(-z)
-    sum_ = 1 - decay * decay + 2 * decay * sine  # (sinh z + sin z) 2 exp(-z)
-    one_minus_sigma = 2 * decay * (sine - cosine - decay) / sum_
-    growing_part = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
+    scaled_sinh_plus_sin = 1 - decay * decay + 2 * decay * sine  # (sinh z + sin z) 2 exp(-z)
+    one_minus_sigma = 2 * decay * (sine - cosine - decay) / scaled_sinh_plus_sin
+    growing_part = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / scaled_sinh_plus_sin
     shape_sign = 1.0 if mode_number % 2 == 1 else -1.0
     mode_values: RealArray = shape_sign * (
         np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + growing_part
@@ -143,35 +143,38 @@ def mode_shape(mode_number: int, x_over_length: ArrayLike) -> RealArray:
     return mode_values
 
 
-def mode_mean(n: int) -> RealArray:
-    """Return the mean of each of the first `n` mode shapes over the beam, shape (n,).
+def mode_shape_mean(mode_count: int) -> RealArray:
+    """Return the mean of each of the first mode shapes over the beam, shape (mode_count,).
 
     Parameters
     ----------
-    n
+    mode_count
         Number of modes, from the first on.
 
     Examples
     --------
-    >>> from rigd.beam import mode_mean
-    >>> print(mode_mean(3).round(4))
+    >>> from rigd.beam import mode_shape_mean
+    >>> print(mode_shape_mean(3).round(4))
     [ 0.783  -0.4339  0.2544]
     """
     shape_means: RealArray = (
-        2 * (-1.0) ** np.arange(n) * root_shear_ratio(n) / clamped_free_eigenvalues(n)
+        2
+        * (-1.0) ** np.arange(mode_count)
+        * root_shear_ratio(mode_count)
+        / clamped_free_eigenvalues(mode_count)
     )
     return shape_means
 
 
-def root_shear_ratio(n: int) -> RealArray:
-    """Return ``-phi'''(0) / (k phi''(0))`` of the first `n` mode shapes phi, shape (n,).
+def root_shear_ratio(mode_count: int) -> RealArray:
+    """Return ``-phi'''(0) / (k phi''(0))`` of the first mode shapes phi, shape (mode_count,).
 
     It relates the shear force at the motor's axis to the bending moment there. A mode of mean
     square 1 and wave number k has the curvature ``phi''(0) = 2 k² (-1)^(i - 1)``.
 
     Parameters
     ----------
-    n
+    mode_count
         Number of modes, from the first on.
 
     Examples
@@ -180,15 +183,15 @@ def root_shear_ratio(n: int) -> RealArray:
     >>> print(root_shear_ratio(3).round(4))
     [0.7341 1.0185 0.9992]
     """
-    z = clamped_free_eigenvalues(n)
+    z = clamped_free_eigenvalues(mode_count)
     decay = np.exp(-z)
-    sum_ = 1 - decay * decay + 2 * decay * np.sin(z)  # (sinh z + sin z) 2 exp(-z)
-    shear_ratios: RealArray = (1 + decay * decay + 2 * decay * np.cos(z)) / sum_
+    scaled_sinh_plus_sin = 1 - decay * decay + 2 * decay * np.sin(z)  # (sinh z + sin z) 2 exp(-z)
+    shear_ratios: RealArray = (1 + decay * decay + 2 * decay * np.cos(z)) / scaled_sinh_plus_sin
     return shear_ratios
 
 
-def participation(beam: Beam, n: int) -> RealArray:
-    """Return the participation factors of the first `n` modes in m³, shape (n,).
+def participation(beam: Beam, mode_count: int) -> RealArray:
+    """Return the participation factors of the first `mode_count` modes in m³, shape (mode_count,).
 
     The factor ``a_i² = 4 L³ / z_i⁴`` times rho is the mode's part of the rigid beam's moment of
     inertia: the sum of all factors is L³/3.
@@ -197,7 +200,7 @@ def participation(beam: Beam, n: int) -> RealArray:
     ----------
     beam
         Beam; only its length is used.
-    n
+    mode_count
         Number of modes, from the first on.
 
     Examples
@@ -208,12 +211,14 @@ def participation(beam: Beam, n: int) -> RealArray:
     >>> print(fraction.round(4))
     [0.9707 0.0247 0.0032]
     """
-    factors_m3: RealArray = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
-    return factors_m3
+    participation_factors_m3: RealArray = (
+        4 * beam.length_m**3 / clamped_free_eigenvalues(mode_count) ** 4
+    )
+    return participation_factors_m3
 
 
-def poles(beam: Beam, damping: Damping, n: int) -> ComplexArray:
-    """Return the poles of the first `n` modes, shape (n, 2), in rad/s.
+def poles(beam: Beam, damping: Damping, mode_count: int) -> ComplexArray:
+    """Return the poles of the first `mode_count` modes, shape (mode_count, 2), in rad/s.
 
     A row has a conjugate pair (positive frequency first), or two real poles (slow one first) where
     integer-order damping exceeds critical damping.
@@ -222,7 +227,7 @@ def poles(beam: Beam, damping: Damping, n: int) -> ComplexArray:
     ----------
     beam, damping
         Parameters of the exact model.
-    n
+    mode_count
         Number of modes, from the first on.
 
     Raises
@@ -239,7 +244,7 @@ def poles(beam: Beam, damping: Damping, n: int) -> ComplexArray:
     [[-0.013 +16.047j -0.013 -16.047j]
      [-0.506+100.563j -0.506-100.563j]]
     """
-    pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(n), beam, damping)
+    pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(mode_count), beam, damping)
     modes_without_pole = np.flatnonzero(np.isnan(pole_pairs[:, 0]))
     if modes_without_pole.size:
         raise ArithmeticError(
@@ -249,7 +254,7 @@ def poles(beam: Beam, damping: Damping, n: int) -> ComplexArray:
 
 
 def poles_for_eigenvalues(
-    z: RealArray, beam: Beam, damping: Damping, near_rad_s: ComplexArray | None = None
+    z: RealArray, beam: Beam, damping: Damping, expected_rad_s: ComplexArray | None = None
 ) -> ComplexArray:
     """Return the pole pair of each mode from its eigenvalue z, shape (len(z), 2), in rad/s.
 
@@ -263,29 +268,31 @@ def poles_for_eigenvalues(
         Clamped–free eigenvalues, or roots of ``tan z = tanh z``, shape (m,).
     beam, damping
         Parameters of the exact model.
-    near_rad_s
+    expected_rad_s
         Expected roots in the upper half plane, shape (m,). If all of them are within the relative
         distance `SAME_ROOT_TOLERANCE` of the true roots, the search starts from them, which is ten
         times faster than a start from the roots of the undamped beam.
     """
     omega_squared = (z / beam.length_m) ** 4 / beam.density_over_stiffness
     external_coefficient = damping.gamma / beam.density_over_stiffness
-    internal_first_order = damping.zeta == 0 or damping.alpha == 1
-    external_first_order = damping.gamma == 0 or damping.lambda_ == 1
-    if internal_first_order and external_first_order:
+    internal_is_first_order = damping.zeta == 0 or damping.alpha == 1
+    external_is_first_order = damping.gamma == 0 or damping.lambda_ == 1
+    if internal_is_first_order and external_is_first_order:
         return _second_order_poles(
             omega_squared, external_coefficient + damping.zeta * omega_squared
         )
-    if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
-        start_log_poles = np.log(near_rad_s)
+    if expected_rad_s is not None and bool((expected_rad_s.imag > 0).all()):
+        start_log_poles = np.log(expected_rad_s)
         log_poles = _newton_roots(
             start_log_poles, omega_squared, external_coefficient, damping.zeta, damping
         )
         if bool((np.abs(log_poles - start_log_poles) < SAME_ROOT_TOLERANCE).all()):
             upper_poles = np.exp(log_poles)
             return np.stack([upper_poles, upper_poles.conj()], axis=1)
-    for steps in _HOMOTOPY_STEP_COUNTS:
-        upper_poles = _poles_by_continuation(omega_squared, external_coefficient, damping, steps)
+    for step_count in _HOMOTOPY_STEP_COUNTS:
+        upper_poles = _poles_by_continuation(
+            omega_squared, external_coefficient, damping, step_count
+        )
         has_no_pole = np.isnan(upper_poles)
         if not has_no_pole.any():
             break
@@ -328,14 +335,14 @@ def pole_gradient(
     )
 
 
-def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
-    """Return the first `n` modes of the damped beam.
+def modes(beam: Beam, damping: Damping, mode_count: int) -> tuple[Mode, ...]:
+    """Return the first `mode_count` modes of the damped beam.
 
     Parameters
     ----------
     beam, damping
         Parameters of the exact model.
-    n
+    mode_count
         Number of modes, from the first on.
 
     Raises
@@ -353,7 +360,7 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
     16.011 Hz, damping ratio 0.22%
     """
     mode_list = []
-    for i, (first_pole, second_pole) in enumerate(poles(beam, damping, n)):
+    for i, (first_pole, second_pole) in enumerate(poles(beam, damping, mode_count)):
         natural_rad_s = float(np.sqrt((first_pole * second_pole).real))
         mode_list.append(
             Mode(
@@ -374,27 +381,27 @@ def _second_order_poles(omega_squared: RealArray, damping_rate: RealArray) -> Co
         (minus_half_rate * minus_half_rate - omega_squared).astype(np.complex128)
     )
     second_roots = first_roots.conj()
-    over_damped = minus_half_rate * minus_half_rate > omega_squared
+    is_over_damped = minus_half_rate * minus_half_rate > omega_squared
     fast_poles = minus_half_rate - np.sqrt(
         np.maximum(minus_half_rate * minus_half_rate - omega_squared, 0.0)
     )
-    second_roots[over_damped] = fast_poles[over_damped]
-    first_roots[over_damped] = (
-        omega_squared[over_damped] / fast_poles[over_damped]
+    second_roots[is_over_damped] = fast_poles[is_over_damped]
+    first_roots[is_over_damped] = (
+        omega_squared[is_over_damped] / fast_poles[is_over_damped]
     )  # no cancellation
     return np.stack([first_roots, second_roots], axis=1)
 
 
 def _poles_by_continuation(
-    omega_squared: RealArray, external_coefficient: float, damping: Damping, steps: int
+    omega_squared: RealArray, external_coefficient: float, damping: Damping, step_count: int
 ) -> ComplexArray:
     """Return the modes' poles in the upper half plane, followed from the undamped ones.
 
-    Damping grows from zero in `steps` steps. A pole is NaN where the path was lost or has left the
-    principal sheet.
+    Damping grows from zero in `step_count` steps. A pole is NaN where the path was lost or has
+    left the principal sheet.
     """
     log_s: ComplexArray = 0.5 * np.log(omega_squared) + 0.5j * np.pi
-    for fraction in (np.arange(1, steps + 1) / steps) ** 2:
+    for fraction in (np.arange(1, step_count + 1) / step_count) ** 2:
         log_s = _newton_roots(
             log_s, omega_squared, fraction * external_coefficient, fraction * damping.zeta, damping
         )
@@ -420,8 +427,8 @@ def _poles_by_search(
         log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping
     )
     has_converged = ~np.isnan(log_s)
-    first_converged = np.argmax(has_converged, axis=1)[:, None]
-    poles: ComplexArray = np.exp(np.take_along_axis(log_s, first_converged, axis=1)[:, 0])
+    first_converged_index = np.argmax(has_converged, axis=1)[:, None]
+    poles: ComplexArray = np.exp(np.take_along_axis(log_s, first_converged_index, axis=1)[:, 0])
     return poles
 
 
@@ -454,6 +461,6 @@ def _newton_roots(
         residual_scale = (
             np.abs(inertial_term) + np.abs(external_term) + np.abs(internal_term) + omega_squared
         )
-        on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _MAX_ARGUMENT_EXCESS_RAD)
+        is_on_principal_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _MAX_ARGUMENT_EXCESS_RAD)
         is_solution = np.abs(equation_residual) < 1e-9 * residual_scale
-        return np.where(is_solution & on_sheet, log_s, np.nan + 0j)
+        return np.where(is_solution & is_on_principal_sheet, log_s, np.nan + 0j)

@@ -24,11 +24,11 @@ from rigd.beam._parameters import (
     OFFSET_PREFIX,
     parameter_named,
 )
-from rigd.beam._plant_roots import CLOSE_START_TOLERANCE, Pole, followed_roots, newton_roots
+from rigd.beam._plant_roots import CLOSE_START_TOLERANCE, Pole, follow_roots, newton_roots
 from rigd.beam._point_force import PointForceGrid
 from rigd.beam._tip_mass import (
+    DerivativeFunctions,
     LoadedResponse,
-    Slopes,
     add_stiffness_offsets,
     differentiated_response,
     loaded_response,
@@ -39,9 +39,9 @@ RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
-_BUTTERWORTH_LOSS: Final = 2**0.5
+_BUTTERWORTH_RECIPROCAL_Q: Final = 2**0.5
 """Reciprocal quality factor of a second-order Butterworth filter."""
-_OWN_PARAMETERS: Final = (
+_PLANT_PARAMETERS: Final = (
     "delay_s",
     "tool_inertia_kg_m2",
     "root_compliance_rad_per_nm",
@@ -52,7 +52,7 @@ _OWN_PARAMETERS: Final = (
 _ATTRIBUTE_NAMES: Final = {"lambda": "lambda_"}
 """Map from a damping parameter's name to its attribute, if the two names differ."""
 
-_POLE_DISTANCE = 1e-8
+_RELATIVE_POLE_DISTANCE = 1e-8
 """Relative distance from a pole at which the response and its derivatives are evaluated.
 
 At the pole itself of a rigidly clamped beam they are infinite.
@@ -134,14 +134,14 @@ class Plant:
         ValueError
             If a plant has no parameter of such a name.
         """
-        changes: dict[str, Any] = {}
+        attribute_changes: dict[str, Any] = {}
         damping_changes: dict[str, float] = {}
         offsets = dict(enumerate(self.stiffness_offsets, start=2))
         for name, value in values.items():
             if name in DAMPING_PARAMETERS:
                 damping_changes[_ATTRIBUTE_NAMES.get(name, name)] = value
-            elif name in _OWN_PARAMETERS:
-                changes[name] = value
+            elif name in _PLANT_PARAMETERS:
+                attribute_changes[name] = value
             elif name.startswith(OFFSET_PREFIX):
                 offsets[int(name.removeprefix(OFFSET_PREFIX))] = value
             elif name not in BEAM_PARAMETERS:
@@ -150,15 +150,15 @@ class Plant:
             density_over_stiffness, stiffness_n_m2 = (
                 values.get(name, getattr(self.beam, name)) for name in BEAM_PARAMETERS
             )
-            changes["beam"] = Beam(
+            attribute_changes["beam"] = Beam(
                 self.beam.length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2
             )
         if damping_changes:
-            changes["damping"] = replace(self.damping, **damping_changes)
-        changes["stiffness_offsets"] = tuple(
+            attribute_changes["damping"] = replace(self.damping, **damping_changes)
+        attribute_changes["stiffness_offsets"] = tuple(
             offsets.get(mode_number, 0.0) for mode_number in range(2, max(offsets, default=1) + 1)
         )
-        return replace(self, **changes)
+        return replace(self, **attribute_changes)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -185,7 +185,7 @@ class Plant:
     @property
     def optional_parameters(self) -> dict[str, float]:
         """Values of ends and filters by name, zeros included."""
-        return {name: getattr(self, name) for name in _OWN_PARAMETERS[2:]}
+        return {name: getattr(self, name) for name in _PLANT_PARAMETERS[2:]}
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "Plant":
@@ -210,7 +210,7 @@ class Plant:
             Beam(**{field.name: float(beam[field.name]) for field in fields(Beam)}),
             Damping(*(float(damping[name]) for name in DAMPING_PARAMETERS)),
             stiffness_offsets=tuple(map(float, document.get("stiffness_offsets", ()))),
-            **{name: float(document.get(name, 0.0)) for name in _OWN_PARAMETERS},
+            **{name: float(document.get(name, 0.0)) for name in _PLANT_PARAMETERS},
         )
 
     def check(self) -> None:
@@ -251,16 +251,16 @@ class Plant:
             If one of these modes of the beam does not oscillate.
         """
         z = clamped_free_eigenvalues(len(frequency_hz))
-        target_rad_s = 2 * math.pi * np.array(frequency_hz)
+        target_frequency_rad_s = 2 * math.pi * np.array(frequency_hz)
         offset_plant = replace(
             self, stiffness_offsets=(), root_compliance_rad_per_nm=0.0, tip_mass_kg=0.0
         )
         relative_stiffness = np.ones(z.size)
         for _ in range(2):  # damping shifts the frequencies a little
-            present_rad_s = offset_plant.poles(z)[:, 0].imag
-            if not bool((present_rad_s > 0).all()):
+            present_frequency_rad_s = offset_plant.poles(z)[:, 0].imag
+            if not bool((present_frequency_rad_s > 0).all()):
                 raise ValueError("A mode of the beam does not oscillate.")
-            relative_stiffness *= (target_rad_s / present_rad_s) ** 2
+            relative_stiffness *= (target_frequency_rad_s / present_frequency_rad_s) ** 2
             density_kg_per_m = self.beam.density_kg_per_m / float(relative_stiffness[0])
             offset_plant = replace(
                 offset_plant,
@@ -326,7 +326,7 @@ class Plant:
     def lags(self) -> tuple[tuple[float, float], ...]:
         """Coefficients of s and s² in the denominators of the torque channel's filters."""
         first_s, second_s = self.filter_time_constant_s, self.second_order_filter_time_constant_s
-        lags = ((first_s, 0.0), (_BUTTERWORTH_LOSS * second_s, second_s * second_s))
+        lags = ((first_s, 0.0), (_BUTTERWORTH_RECIPROCAL_Q * second_s, second_s * second_s))
         return tuple(lag for lag in lags if any(lag))
 
     def pole_gradients(self, poles_rad_s: ComplexArray, wrt: Sequence[str]) -> ComplexArray:
@@ -343,7 +343,7 @@ class Plant:
             Parameter names as for `transfer_and_gradient`. The derivative with respect to a
             parameter that does not affect the poles is 0.
         """
-        pole_distance = 0.0 if self.root_compliance_rad_per_nm else _POLE_DISTANCE
+        pole_distance = 0.0 if self.root_compliance_rad_per_nm else _RELATIVE_POLE_DISTANCE
         s = poles_rad_s * (1 - pole_distance)
         clamped_response, derivative_functions = self._response_and_slopes(s)
         response_slope = self.derivative_by_s(s, clamped_response)
@@ -358,7 +358,7 @@ class Plant:
         if any(self.stiffness_offsets):
             raise ValueError("The shear of modes with their own stiffness is not known.")
 
-    def _response_and_slopes(self, s: ComplexArray) -> tuple[LoadedResponse, Slopes]:
+    def _response_and_slopes(self, s: ComplexArray) -> tuple[LoadedResponse, DerivativeFunctions]:
         """Return the coupling torque per angle on a rigid clamp, and functions for its derivatives.
 
         The derivative with respect to the clamp's compliance is that at a compliance of 0.
@@ -484,7 +484,7 @@ class Plant:
             Residue at each pole, in N·m s.
         """
         # On a rigid clamp G is infinite at a pole, but close to it the ratio is accurate.
-        pole_distance = 0.0 if self.root_compliance_rad_per_nm else _POLE_DISTANCE
+        pole_distance = 0.0 if self.root_compliance_rad_per_nm else _RELATIVE_POLE_DISTANCE
         s = poles_rad_s * (1 - pole_distance)
         clamped_response = self.rigid_clamp_response(s)
         residues: ComplexArray = (
@@ -513,14 +513,14 @@ class Plant:
         internal_term = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
         external_term = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
         inertial_factor = 2 * self.beam.density_over_stiffness * s * s + external_term
-        by_log_s: ComplexArray = (
-            clamped_response.by_elastic * internal_term
-            + clamped_response.by_inertial * inertial_factor
-            + 2 * self.tip_mass_kg * clamped_response.by_mass
+        slope_by_log_s: ComplexArray = (
+            clamped_response.slope_by_elastic_factor * internal_term
+            + clamped_response.slope_by_inertial_factor * inertial_factor
+            + 2 * self.tip_mass_kg * clamped_response.slope_by_mass
         )
-        return by_log_s / s
+        return slope_by_log_s / s
 
-    def poles(self, z: RealArray, near_rad_s: ComplexArray | None = None) -> ComplexArray:
+    def poles(self, z: RealArray, expected_rad_s: ComplexArray | None = None) -> ComplexArray:
         """Return both poles of each mode with locked hub, shape (len(z), 2), in rad/s.
 
         The poles are followed from those of the beam on a rigid clamp without a tip mass while mass
@@ -530,7 +530,7 @@ class Plant:
         ----------
         z : ndarray
             Clamped-free eigenvalues of the modes.
-        near_rad_s : ndarray of complex, shape (len(z),), optional
+        expected_rad_s : ndarray of complex, shape (len(z),), optional
             Expected poles in the upper half plane in rad/s, one per mode, from which the search
             starts.
 
@@ -540,11 +540,13 @@ class Plant:
             Conjugate pairs (positive frequency first) or two real poles. A row is NaN if the pole
             could not be followed.
         """
-        if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
-            upper_poles = self._newton_roots(near_rad_s, CLOSE_START_TOLERANCE, zeros=False)
-            if bool((np.abs(upper_poles / near_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
+        if expected_rad_s is not None and bool((expected_rad_s.imag > 0).all()):
+            upper_poles = self._newton_roots(
+                expected_rad_s, CLOSE_START_TOLERANCE, find_zeros=False
+            )
+            if bool((np.abs(upper_poles / expected_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
                 return np.column_stack([upper_poles, upper_poles.conj()])
-        return self._followed_roots(z, zeros=False)
+        return self._follow_roots(z, find_zeros=False)
 
     def zeros(self, z: RealArray) -> ComplexArray:
         """Return the zeros of the coupling torque per angle in rad/s, in pairs as in `poles`.
@@ -554,57 +556,61 @@ class Plant:
         z : ndarray
             Roots of ``tan z = tanh z``, which determine the zeros of the uniform beam.
         """
-        return self._followed_roots(z, zeros=True)
+        return self._follow_roots(z, find_zeros=True)
 
-    def _followed_roots(self, z: RealArray, *, zeros: bool) -> ComplexArray:
+    def _follow_roots(self, z: RealArray, *, find_zeros: bool) -> ComplexArray:
         """Return poles or zeros, followed from those of the uniform beam with eigenvalues `z`."""
         offsets = np.array(self.stiffness_offsets)
-        if not zeros and offsets.size:
+        if not find_zeros and offsets.size:
             # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
             z = z.copy()
             z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
         roots = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
-        is_rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
-        if is_rigid and not (zeros and offsets.any()):
+        has_ideal_ends = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
+        if has_ideal_ends and not (find_zeros and offsets.any()):
             return roots
         relative_change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
         stiffness_nm_per_rad = self.beam.bending_stiffness_n_m2 / self.beam.length_m
         relative_change = max(
             relative_change, self.root_compliance_rad_per_nm * stiffness_nm_per_rad
         )
-        if zeros:
+        if find_zeros:
             relative_change = max(relative_change, float(np.abs(offsets).max(initial=0.0)))
 
         def roots_near(
-            fraction: float, start_roots: ComplexArray, step_tolerance: float
+            change_fraction: float, start_roots: ComplexArray, step_tolerance: float
         ) -> ComplexArray:
             partial_plant = replace(
                 self,
-                tip_mass_kg=fraction * self.tip_mass_kg,
-                root_compliance_rad_per_nm=fraction * self.root_compliance_rad_per_nm,
-                stiffness_offsets=tuple((fraction if zeros else 1.0) * offsets),
+                tip_mass_kg=change_fraction * self.tip_mass_kg,
+                root_compliance_rad_per_nm=change_fraction * self.root_compliance_rad_per_nm,
+                stiffness_offsets=tuple((change_fraction if find_zeros else 1.0) * offsets),
             )
-            return partial_plant._newton_roots(start_roots, step_tolerance, zeros=zeros)
+            return partial_plant._newton_roots(start_roots, step_tolerance, find_zeros=find_zeros)
 
-        return followed_roots(roots, relative_change, roots_near)
+        return follow_roots(roots, relative_change, roots_near)
 
-    def _newton_roots(self, s: ComplexArray, step_tolerance: float, *, zeros: bool) -> ComplexArray:
-        """Return the roots near `s` of ``1/G + kappa``, or of G if `zeros` is true."""
+    def _newton_roots(
+        self, s: ComplexArray, step_tolerance: float, *, find_zeros: bool
+    ) -> ComplexArray:
+        """Return the roots near `s` of ``1/G + kappa``, or of G if `find_zeros` is true."""
 
         def newton_step(s: ComplexArray) -> ComplexArray:
             clamped_response = self.rigid_clamp_response(s)
-            factor = (
-                -1 if zeros else 1 + self.root_compliance_rad_per_nm * clamped_response.response
+            step_factor = (
+                -1
+                if find_zeros
+                else 1 + self.root_compliance_rad_per_nm * clamped_response.response
             )
-            step: ComplexArray = (
-                clamped_response.response / self.derivative_by_s(s, clamped_response) * factor
+            newton_step_rad_s: ComplexArray = (
+                clamped_response.response / self.derivative_by_s(s, clamped_response) * step_factor
             )
-            return step
+            return newton_step_rad_s
 
         return newton_roots(newton_step, s, step_tolerance)
 
     def mode_poles(
-        self, mode_count: int, wrt: Sequence[str] = (), near_rad_s: Sequence[complex] = ()
+        self, mode_count: int, wrt: Sequence[str] = (), expected_rad_s: Sequence[complex] = ()
     ) -> tuple[Pole, ...]:
         """Return the poles of the first modes, with their derivatives for the parameters `wrt`.
 
@@ -617,13 +623,13 @@ class Plant:
         wrt
             Names of parameters as for `transfer_and_gradient`. The derivative with respect to a
             parameter that does not affect the poles is 0.
-        near_rad_s
+        expected_rad_s
             Approximate poles in the order of the modes, if all are known.
         """
-        start_poles = np.array(near_rad_s) if len(near_rad_s) == mode_count > 0 else None
+        start_poles = np.array(expected_rad_s) if len(expected_rad_s) == mode_count > 0 else None
         z = clamped_free_eigenvalues(mode_count)
-        has_ends = bool(self.tip_mass_kg or self.root_compliance_rad_per_nm)
-        if has_ends:
+        has_end_parameters = bool(self.tip_mass_kg or self.root_compliance_rad_per_nm)
+        if has_end_parameters:
             pole_pairs = self.poles(z, start_poles)
         else:
             # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
@@ -640,7 +646,7 @@ class Plant:
             if not np.isnan(pole_pair).any()
             for pole in pole_pair[: 1 if pole_pair[0].imag else 2]
         ]
-        if has_ends or not set(END_PARAMETERS).isdisjoint(wrt):
+        if has_end_parameters or not set(END_PARAMETERS).isdisjoint(wrt):
             poles_rad_s = np.array([pole for _, pole in modes_and_poles], dtype=np.complex128)
             derivatives = [*self.pole_gradients(poles_rad_s, wrt)]
         else:

@@ -12,7 +12,7 @@ ComplexArray = NDArray[np.complex128]
 
 _MAX_HOMOTOPY_STEPS = 12
 """Largest number of steps in which the tip mass and the clamp's compliance grow from zero."""
-_CHANGE_PER_STEP = 0.02
+_RELATIVE_CHANGE_PER_STEP = 0.02
 """Growth of tip mass and compliance in one step while poles are followed.
 
 It is relative to the mass and the compliance of the beam itself."""
@@ -24,11 +24,11 @@ CLOSE_START_TOLERANCE = 1e-6
 """Relative length of Newton's last step from a start close to the root.
 
 Convergence is quadratic there from the first step on."""
-_INTERMEDIATE_TOLERANCE = 1e-4
+_INTERMEDIATE_STEP_TOLERANCE = 1e-4
 """Relative length of Newton's last step before tip mass and compliance have their full size."""
 _MAX_ROOT_TO_START_RATIO = 10.0
 """Largest ratio of a root to the start of Newton's method that is accepted."""
-_START_POLE_DISTANCE = 1e-7
+_RELATIVE_START_DISTANCE = 1e-7
 """Relative distance of the first starts from the poles, where G of an undamped beam is infinite."""
 
 
@@ -75,7 +75,7 @@ class Pole:
         return np.asarray(damping_derivatives, dtype=np.float64)
 
 
-def followed_roots(
+def follow_roots(
     uniform_roots: ComplexArray,
     relative_change: float,
     roots_near: Callable[[float, ComplexArray, float], ComplexArray],
@@ -92,9 +92,11 @@ def followed_roots(
     is_oscillating = roots[has_root][:, 0].imag != 0
     second_real_poles = roots[has_root][~is_oscillating][:, 1]
     current_roots = np.concatenate([roots[has_root][:, 0], second_real_poles])
-    current_roots *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
+    current_roots *= 1 - _RELATIVE_START_DISTANCE  # G is infinite at an undamped pole
     # A change that moves the poles little needs few steps.
-    step_count = min(max(math.ceil(relative_change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
+    step_count = min(
+        max(math.ceil(relative_change / _RELATIVE_CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS
+    )
     previous_roots = current_roots
     for step_number in range(1, step_count + 1):
         is_last_step = step_number == step_count
@@ -104,7 +106,7 @@ def followed_roots(
             roots_near(
                 step_number / step_count,
                 start_roots,
-                _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_TOLERANCE,
+                _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_STEP_TOLERANCE,
             ),
         )
     first_roots = current_roots[: is_oscillating.size]

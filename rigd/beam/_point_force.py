@@ -34,9 +34,9 @@ from rigd.beam._model import Beam, Damping
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_SERIES_LIMIT = 40.0
+_MAX_SERIES_ARGUMENT = 40.0
 """Magnitude of q at which the power series are replaced by exponentials."""
-_SERIES_TERMS = 9
+_SERIES_TERM_COUNT = 9
 """Number of terms of each power series; the first omitted term is below 40^9 / 36! = 7e-28."""
 
 
@@ -82,7 +82,7 @@ class PointForceGrid:
         self._b4: ComplexArray = (
             -(inertial_term + damping.gamma * s_points**damping.lambda_) / internal_factor
         )
-        is_small = np.abs(self._b4) * beam.length_m**4 < _SERIES_LIMIT
+        is_small = np.abs(self._b4) * beam.length_m**4 < _MAX_SERIES_ARGUMENT
         self._small_q_indices, self._large_q_indices = (
             np.flatnonzero(is_small),
             np.flatnonzero(~is_small),
@@ -105,20 +105,20 @@ class PointForceGrid:
             Displacement, or derivative, in m^(1 - order)/rad.
         """
         x = np.asarray(x_m, dtype=np.float64)
-        out = np.empty((self._b4.size, x.size), dtype=np.complex128)
+        displacement = np.empty((self._b4.size, x.size), dtype=np.complex128)
         b4 = self._b4[self._small_q_indices, None]
         moment, shear = self._root_derivatives(
             b4, b4 * self._series_at_tip(3), b4 * self._series_at_tip(2)
         )
-        out[self._small_q_indices] = (
+        displacement[self._small_q_indices] = (
             _power_series(b4, x.ravel(), 1, derivative_order)
             + moment * _power_series(b4, x.ravel(), 2, derivative_order)
             + shear * _power_series(b4, x.ravel(), 3, derivative_order)
         )
-        out[self._large_q_indices] = self._exponentials.response_per_angle(
+        displacement[self._large_q_indices] = self._exponentials.response_per_angle(
             x.ravel(), derivative_order
         )
-        return out.reshape((*self._shape, *x.shape))
+        return displacement.reshape((*self._shape, *x.shape))
 
     def displacement_per_force(
         self, x_m: ArrayLike, force_at_m: ArrayLike, derivative_order: int = 0
@@ -146,28 +146,28 @@ class PointForceGrid:
         )
         shape = x.shape
         x, force_x = x.ravel(), force_x.ravel()
-        out = np.empty((self._b4.size, x.size), dtype=np.complex128)
+        displacement = np.empty((self._b4.size, x.size), dtype=np.complex128)
         b4, stiffness = (
             self._b4[self._small_q_indices, None],
             self._q_stiffness[self._small_q_indices, None],
         )
-        distance_to_tip = self._length_m - force_x
+        force_to_tip_m = self._length_m - force_x
         moment, shear = self._root_derivatives(
-            b4, _power_series(b4, distance_to_tip, 1), _power_series(b4, distance_to_tip, 0)
+            b4, _power_series(b4, force_to_tip_m, 1), _power_series(b4, force_to_tip_m, 0)
         )
-        beyond_force = np.where(
+        term_beyond_force = np.where(
             x > force_x, _power_series(b4, np.maximum(x - force_x, 0.0), 3, derivative_order), 0.0
         )
-        out[self._small_q_indices] = (
+        displacement[self._small_q_indices] = (
             moment * _power_series(b4, x, 2, derivative_order)
             + shear * _power_series(b4, x, 3, derivative_order)
-            + beyond_force
+            + term_beyond_force
         ) / stiffness
-        out[self._large_q_indices] = (
+        displacement[self._large_q_indices] = (
             self._exponentials.response_per_force_over_stiffness(x, force_x, derivative_order)
             / self._q_stiffness[self._large_q_indices, None]
         )
-        return out.reshape((*self._shape, *shape))
+        return displacement.reshape((*self._shape, *shape))
 
     def torque_per_angle(self) -> ComplexArray:
         """Return the motor's torque on the beam per angle (Eq. 25) in N·m/rad.
@@ -210,13 +210,15 @@ class PointForceGrid:
             np.zeros_like(force_x), force_x, 3
         )
 
-    def _bending_stiffness(self, axes: int = 0) -> ComplexArray:
-        """Return the complex bending stiffness Q in N·m²; `axes` axes of length 1 are appended."""
-        return self._q_stiffness.reshape(self._shape + (1,) * axes)
+    def _bending_stiffness(self, appended_axis_count: int = 0) -> ComplexArray:
+        """Return the complex bending stiffness Q in N·m², with axes of length 1 appended."""
+        return self._q_stiffness.reshape(self._shape + (1,) * appended_axis_count)
 
-    def _series_at_tip(self, n: int) -> ComplexArray:
+    def _series_at_tip(self, series_index: int) -> ComplexArray:
         """Return the power series ``K_n`` at the tip at the s with small q, shape (low, 1)."""
-        return _power_series(self._b4[self._small_q_indices, None], np.array([self._length_m]), n)
+        return _power_series(
+            self._b4[self._small_q_indices, None], np.array([self._length_m]), series_index
+        )
 
     def _root_derivatives(
         self, b4: ComplexArray, tip_moment: ComplexArray, tip_shear: ComplexArray
@@ -234,21 +236,23 @@ class PointForceGrid:
 
 
 def _power_series(
-    b4: ComplexArray, x: RealArray, n: int, derivative_order: int = 0
+    b4: ComplexArray, x: RealArray, series_index: int, derivative_order: int = 0
 ) -> ComplexArray:
     """Return the power series ``K_n``, or a derivative of it, at the points x, shape (s, m).
 
     `b4` is ``-P/Q``, shape (s, 1); x has the shape (m,).
     """
-    n -= derivative_order
-    if n < 0:
-        return b4 * _power_series(b4, x, n + 4)
+    series_index -= derivative_order
+    if series_index < 0:
+        return b4 * _power_series(b4, x, series_index + 4)
     series_argument = b4 * x**4
-    series_sum = np.full_like(series_argument, 1 / factorial(4 * (_SERIES_TERMS - 1) + n))
-    for k in range(_SERIES_TERMS - 2, -1, -1):
+    series_sum = np.full_like(
+        series_argument, 1 / factorial(4 * (_SERIES_TERM_COUNT - 1) + series_index)
+    )
+    for k in range(_SERIES_TERM_COUNT - 2, -1, -1):
         series_sum *= series_argument
-        series_sum += 1 / factorial(4 * k + n)
-    return series_sum * x**n
+        series_sum += 1 / factorial(4 * k + series_index)
+    return series_sum * x**series_index
 
 
 @dataclass(init=False, slots=True)
@@ -294,19 +298,22 @@ class _ExponentialSolution:
         the shape (s, m).
         """
         b, c, kappa = self._b, self._kappa * self._b, self._kappa
-        decaying_amplitude = -1 / (4 * b**3)  # A, of the decaying wave
-        other_amplitude = -decaying_amplitude / kappa  # B, of the other
-        to_root = decaying_amplitude * np.exp(-b * force_x), other_amplitude * np.exp(-c * force_x)
-        to_tip = (
-            decaying_amplitude * np.exp(-b * (self._length_m - force_x)),
-            other_amplitude * np.exp(-c * (self._length_m - force_x)),
+        first_wave_amplitude = -1 / (4 * b**3)  # A, of the decaying wave
+        second_wave_amplitude = -first_wave_amplitude / kappa  # B, of the other
+        waves_at_root = (
+            first_wave_amplitude * np.exp(-b * force_x),
+            second_wave_amplitude * np.exp(-c * force_x),
         )
-        at_ends = np.stack(
+        waves_at_tip = (
+            first_wave_amplitude * np.exp(-b * (self._length_m - force_x)),
+            second_wave_amplitude * np.exp(-c * (self._length_m - force_x)),
+        )
+        direct_end_values = np.stack(
             [
-                to_root[0] + to_root[1],
-                to_root[0] + kappa * to_root[1],
-                to_tip[0] - to_tip[1],
-                -to_tip[0] + kappa * to_tip[1],
+                waves_at_root[0] + waves_at_root[1],
+                waves_at_root[0] + kappa * waves_at_root[1],
+                waves_at_tip[0] - waves_at_tip[1],
+                -waves_at_tip[0] + kappa * waves_at_tip[1],
             ],
             axis=1,
         )
@@ -314,10 +321,12 @@ class _ExponentialSolution:
         derivative_sign = np.where(
             x > force_x, -1.0, 1.0
         )  # the sign of each derivative of exp(-b r)
-        direct_response = (derivative_sign * b) ** derivative_order * decaying_amplitude * np.exp(
+        direct_response = (derivative_sign * b) ** derivative_order * first_wave_amplitude * np.exp(
             -b * distance_m
-        ) + (derivative_sign * c) ** derivative_order * other_amplitude * np.exp(-c * distance_m)
-        coefficients = -self._inverse @ at_ends
+        ) + (derivative_sign * c) ** derivative_order * second_wave_amplitude * np.exp(
+            -c * distance_m
+        )
+        coefficients = -self._inverse @ direct_end_values
         return direct_response + self._weighted_sum(coefficients, x, derivative_order)
 
     def _weighted_sum(
@@ -325,12 +334,12 @@ class _ExponentialSolution:
     ) -> ComplexArray:
         """Return the four exponential solutions' weighted sum; weights of shape (s, 4, m or 1)."""
         b, c = self._b, self._kappa * self._b
-        from_tip = self._length_m - x
+        distance_from_tip_m = self._length_m - x
         exponentials = (
             (-b) ** derivative_order * np.exp(-b * x),
-            b**derivative_order * np.exp(-b * from_tip),
+            b**derivative_order * np.exp(-b * distance_from_tip_m),
             (-c) ** derivative_order * np.exp(-c * x),
-            c**derivative_order * np.exp(-c * from_tip),
+            c**derivative_order * np.exp(-c * distance_from_tip_m),
         )
         weighted_sum: ComplexArray = sum(
             (coefficients[:, i] * exponential for i, exponential in enumerate(exponentials)),

@@ -98,7 +98,9 @@ class ResponseGrid:
         G is the torque over the motor angle, in N·m/rad. The derivatives are with respect to the
         parameters in `wrt` on which G depends, by the parameters' names.
         """
-        beam_names = [parameter_name for parameter_name in wrt if parameter_name in GRADIENT_NAMES]
+        beam_parameter_names = [
+            parameter_name for parameter_name in wrt if parameter_name in GRADIENT_NAMES
+        ]
         if plant.tip_mass_kg or plant.stiffness_offsets:
             loaded_response, derivatives = differentiated_response(
                 self._log_s,
@@ -109,11 +111,12 @@ class ResponseGrid:
                 plant.stiffness_offsets,
             )
             return loaded_response.response, {
-                parameter_name: derivatives[parameter_name]() for parameter_name in beam_names
+                parameter_name: derivatives[parameter_name]()
+                for parameter_name in beam_parameter_names
             }
-        if not beam_names:
+        if not beam_parameter_names:
             return self._beam_grid.evaluate(plant.beam, plant.damping), {}
         beam_response, derivative_rows = self._beam_grid.evaluate_with_gradient(
-            plant.beam, plant.damping, beam_names
+            plant.beam, plant.damping, beam_parameter_names
         )
-        return beam_response, dict(zip(beam_names, derivative_rows, strict=True))
+        return beam_response, dict(zip(beam_parameter_names, derivative_rows, strict=True))

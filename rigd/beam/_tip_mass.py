@@ -35,7 +35,7 @@ from rigd.beam._modes import (
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_SERIES_LIMIT = 40.0
+_MAX_SERIES_ARGUMENT = 40.0
 """Magnitude of q below which power series replace the closed form, which cancels there."""
 _POWERS_OF_MINUS_FOUR = (-4.0) ** np.arange(10)
 _SERIES_COEFFICIENTS = np.array(
@@ -60,11 +60,11 @@ class LoadedResponse:
 
     response: ComplexArray
     """Coupling torque per motor angle in N·m/rad."""
-    by_elastic: ComplexArray
+    slope_by_elastic_factor: ComplexArray
     """Derivative of the response with respect to the elastic factor c."""
-    by_inertial: ComplexArray
+    slope_by_inertial_factor: ComplexArray
     """Derivative of the response with respect to the inertial factor p."""
-    by_mass: ComplexArray
+    slope_by_mass: ComplexArray
     """Derivative of the response with respect to the tip mass, in N·m/(rad kg)."""
 
 
@@ -82,23 +82,23 @@ def loaded_response(
     """
     stiffness_n_m2, length_m = beam.bending_stiffness_n_m2, beam.length_m
     f, u, f_slope, u_slope = _response_functions(-(length_m**4) * inertial_factor / elastic_factor)
-    per_mass = s_squared / (length_m * stiffness_n_m2 * inertial_factor)
-    mass_ratio = tip_mass_kg * per_mass
+    ratio_per_mass = s_squared / (length_m * stiffness_n_m2 * inertial_factor)
+    mass_ratio = tip_mass_kg * ratio_per_mass
     inverse_factor = 1 / (1 - mass_ratio * f)
-    loaded_f = (f + mass_ratio * u) * inverse_factor
-    by_ratio = (u + loaded_f * f) * inverse_factor
+    loaded_function = (f + mass_ratio * u) * inverse_factor
+    slope_by_ratio = (u + loaded_function * f) * inverse_factor
     loaded_slope = (
-        f_slope + mass_ratio * u_slope + mass_ratio * loaded_f * f_slope
+        f_slope + mass_ratio * u_slope + mass_ratio * loaded_function * f_slope
     ) * inverse_factor
-    per_length = -stiffness_n_m2 / length_m
+    minus_stiffness_per_length = -stiffness_n_m2 / length_m
     return LoadedResponse(
-        response=per_length * elastic_factor * loaded_f,
-        by_elastic=per_length * (loaded_f - loaded_slope),
-        by_inertial=per_length
+        response=minus_stiffness_per_length * elastic_factor * loaded_function,
+        slope_by_elastic_factor=minus_stiffness_per_length * (loaded_function - loaded_slope),
+        slope_by_inertial_factor=minus_stiffness_per_length
         * elastic_factor
         / inertial_factor
-        * (loaded_slope - mass_ratio * by_ratio),
-        by_mass=per_length * elastic_factor * per_mass * by_ratio,
+        * (loaded_slope - mass_ratio * slope_by_ratio),
+        slope_by_mass=minus_stiffness_per_length * elastic_factor * ratio_per_mass * slope_by_ratio,
     )
 
 
@@ -115,15 +115,15 @@ def add_stiffness_offsets(
     s of the uniform response.
     """
     length_m, stiffness_n_m2 = beam.length_m, beam.bending_stiffness_n_m2
-    total_response, by_elastic, by_inertial = np.zeros(
+    total_response, slope_by_elastic_factor, slope_by_inertial_factor = np.zeros(
         (3, *np.shape(elastic_factor)), dtype=np.complex128
     )
     z = clamped_free_eigenvalues(1 + len(stiffness_offsets))[1:]
     for k4, offset in zip((z / length_m) ** 4, stiffness_offsets, strict=True):
         # a² EI k⁴, with the participation a² = 4 L³ / z⁴
-        mode_weight, stiffer_mode = 4 * stiffness_n_m2 / length_m, 1 + offset
+        mode_weight, relative_mode_stiffness = 4 * stiffness_n_m2 / length_m, 1 + offset
         uniform_mode_response = 1 / (elastic_factor * k4 + inertial_factor)
-        offset_mode_response = 1 / (elastic_factor * k4 * stiffer_mode + inertial_factor)
+        offset_mode_response = 1 / (elastic_factor * k4 * relative_mode_stiffness + inertial_factor)
         total_response += (
             mode_weight
             * inertial_factor**2
@@ -132,26 +132,27 @@ def add_stiffness_offsets(
             * uniform_mode_response
             * offset_mode_response
         )
-        by_elastic += (
+        slope_by_elastic_factor += (
             mode_weight
             * inertial_factor**2
-            * (stiffer_mode * offset_mode_response**2 - uniform_mode_response**2)
+            * (relative_mode_stiffness * offset_mode_response**2 - uniform_mode_response**2)
         )
-        by_inertial += (
+        slope_by_inertial_factor += (
             mode_weight
             * elastic_factor**2
             * k4
-            * ((stiffer_mode * offset_mode_response) ** 2 - uniform_mode_response**2)
+            * ((relative_mode_stiffness * offset_mode_response) ** 2 - uniform_mode_response**2)
         )
     return replace(
         uniform_response,
         response=uniform_response.response + total_response,
-        by_elastic=uniform_response.by_elastic + by_elastic,
-        by_inertial=uniform_response.by_inertial + by_inertial,
+        slope_by_elastic_factor=uniform_response.slope_by_elastic_factor + slope_by_elastic_factor,
+        slope_by_inertial_factor=uniform_response.slope_by_inertial_factor
+        + slope_by_inertial_factor,
     )
 
 
-Slopes = dict[str, Callable[[], ComplexArray]]
+DerivativeFunctions = dict[str, Callable[[], ComplexArray]]
 """Map from a parameter's name to a function that computes the derivative of the response."""
 
 
@@ -162,7 +163,7 @@ def differentiated_response(
     damping: Damping,
     tip_mass_kg: float,
     stiffness_offsets: tuple[float, ...] = (),
-) -> tuple[LoadedResponse, Slopes]:
+) -> tuple[LoadedResponse, DerivativeFunctions]:
     """Return the torque per angle of a rigidly clamped beam with a tip mass, and its derivatives.
 
     The Laplace variable is not 0. The derivatives are functions by the names of
@@ -182,13 +183,13 @@ def differentiated_response(
             response, elastic_factor, inertial_factor, beam, stiffness_offsets
         )
     return response, {
-        "zeta": lambda: response.by_elastic * s_alpha,
-        "alpha": lambda: response.by_elastic * (damping.zeta * log_s * s_alpha),
-        "gamma": lambda: response.by_inertial * s_lambda,
-        "lambda": lambda: response.by_inertial * (damping.gamma * log_s * s_lambda),
-        "ln_density_over_stiffness": lambda: response.by_inertial * inertial_term,
-        "ln_stiffness": lambda: response.response - tip_mass_kg * response.by_mass,
-        "tip_mass_kg": lambda: response.by_mass,
+        "zeta": lambda: response.slope_by_elastic_factor * s_alpha,
+        "alpha": lambda: response.slope_by_elastic_factor * (damping.zeta * log_s * s_alpha),
+        "gamma": lambda: response.slope_by_inertial_factor * s_lambda,
+        "lambda": lambda: response.slope_by_inertial_factor * (damping.gamma * log_s * s_lambda),
+        "ln_density_over_stiffness": lambda: response.slope_by_inertial_factor * inertial_term,
+        "ln_stiffness": lambda: response.response - tip_mass_kg * response.slope_by_mass,
+        "tip_mass_kg": lambda: response.slope_by_mass,
     }
 
 
@@ -201,8 +202,8 @@ def uniform_tip_response(
     """
     external_term = damping.gamma * s**damping.lambda_
     internal_factor = 1 + damping.zeta * s**damping.alpha
-    fourth_power = -(beam.density_over_stiffness * s * s + external_term) / internal_factor
-    z = beam.length_m * np.sqrt(np.sqrt(fourth_power))
+    wave_number_fourth = -(beam.density_over_stiffness * s * s + external_term) / internal_factor
+    z = beam.length_m * np.sqrt(np.sqrt(wave_number_fourth))
     # Numerators and denominator over exp(z - j sign z): nothing overflows.
     imaginary_sign = np.where(z.imag < 0, -1.0, 1.0)
     rotation, decay = np.exp(1j * imaginary_sign * z), np.exp(-z)
@@ -221,7 +222,7 @@ def _response_functions(
     """Return the loaded beam's dimensionless functions F and U at `q`, and q F' and q U'."""
     q = np.asarray(q, dtype=np.complex128)
     f, u, b = np.empty((3, *q.shape), dtype=np.complex128)
-    is_small = np.abs(q) < _SERIES_LIMIT
+    is_small = np.abs(q) < _MAX_SERIES_ARGUMENT
     if is_small.any():
         small_q = q[is_small]
         series_divisor, *series_numerators = np.polynomial.polynomial.polyval(
@@ -230,12 +231,14 @@ def _response_functions(
         for out, series_numerator in zip((f, u, b), series_numerators, strict=True):
             out[is_small] = small_q * series_numerator / series_divisor
     if not is_small.all():
-        for out, function_values in zip((f, u, b), _scaled_functions(q[~is_small]), strict=True):
+        for out, function_values in zip(
+            (f, u, b), _functions_at_large_q(q[~is_small]), strict=True
+        ):
             out[~is_small] = function_values
     return f, u, 0.25 * (f + u + f * f), 0.5 * (u + b) + 0.25 * u * f
 
 
-def _scaled_functions(q: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+def _functions_at_large_q(q: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return F, U and z² B at large `q`, computed from decaying exponentials only."""
     # F, U and B are real functions of q: values below the real axis mirror those above it.
     lower_half_plane = q.imag < 0
@@ -244,13 +247,13 @@ def _scaled_functions(q: ComplexArray) -> tuple[ComplexArray, ComplexArray, Comp
     a, b = decay * decay, rotation * rotation
     reciprocal = 1 / (4 * decay * rotation + (1 + a) * (1 + b))
     sine, cosine = 1j * (1 - b) * (1 + a), (1 + b) * (1 - a)
-    scaled_values = (
+    upper_half_values = (
         z * (sine - cosine) * reciprocal,
         2j * z**2 * (1 - a) * (1 - b) * reciprocal,
         z**3 * (sine + cosine) * reciprocal,
     )
     scaled_f, scaled_u, scaled_b = (
         np.where(lower_half_plane, function_values.conj(), function_values)
-        for function_values in scaled_values
+        for function_values in upper_half_values
     )
     return scaled_f, scaled_u, scaled_b

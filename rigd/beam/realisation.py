@@ -42,7 +42,7 @@ _HIGHEST_MODE_HZ = 1200.0
 """Frequency in Hz up to which a realisation includes the beam's modes."""
 _MAX_MODES = 300
 """Largest number of modes that a realisation may have; more indicate wrong units of the beam."""
-_HEAVY_DAMPING_RATIO = 0.8
+_MAX_MODAL_DAMPING_RATIO = 0.8
 """Damping ratio from which a pole pair above the fitted band is omitted.
 
 With the real poles next to it, it would only allow huge residues that cancel in the band."""
@@ -52,11 +52,11 @@ _FIT_BAND_HZ = (0.02, 500.0)
 """Frequency band in Hz in which the fit of the residues has the weight 1."""
 _TAIL_BAND_HZ = (1e-4, 1080.0)
 """Lowest and highest frequency in Hz of the fit's grid outside `_FIT_BAND_HZ`."""
-_TAIL_WEIGHT = 1e-3
+_FIT_TAIL_WEIGHT = 1e-3
 """Weight of the fit outside `_FIT_BAND_HZ`; it makes unstable realisations unlikely."""
-_MIN_RELATIVE_DISTANCE = 3e-7
+_MIN_RELATIVE_ROOT_DISTANCE = 3e-7
 """Smallest distance of a fitted frequency from a pole or zero, relative to the frequency."""
-_MAX_OUTPUT_ERROR = 3e-3
+_MAX_RELATIVE_OUTPUT_ERROR = 3e-3
 """Largest accepted relative error (rms) of an additional output of a realisation."""
 _SINGULAR_VALUE_CUTOFF = 1e-10
 """Relative singular value below which the least-squares fit drops a combination of poles.
@@ -136,8 +136,8 @@ def state_output(
     realisation: Realisation,
     response: Callable[[NDArray[np.complex128]], ComplexArray],
     *,
-    inertial: bool,
-    small: float = 0.0,
+    has_inertial_term: bool,
+    response_floor: float = 0.0,
 ) -> StateOutput:
     """Fit another response of the beam, such as its base shear, to the states of a realisation.
 
@@ -148,9 +148,9 @@ def state_output(
     response
         Function that returns the response per motor angle at an array of s (rad/s), in the shape
         of s. It must have the poles of the coupling torque.
-    inertial
+    has_inertial_term
         Whether the response may have a term proportional to the angular acceleration (D).
-    small
+    response_floor
         Size of the response below which its error is relative to this size.
 
     Returns
@@ -171,29 +171,29 @@ def state_output(
     exact_response = response(s)
     basis_columns = _basis_functions(s, poles)
     fitted_columns = np.arange(basis_columns.shape[1])
-    if not inertial:
+    if not has_inertial_term:
         fitted_columns = np.delete(fitted_columns, -3)
-    response_size = np.abs(exact_response) + small
+    response_size = np.abs(exact_response) + response_floor
     weighted_columns = basis_columns[:, fitted_columns] * (point_weights / response_size)[:, None]
-    real_rows = np.concatenate([weighted_columns.real, weighted_columns.imag])
-    column_scale = np.linalg.norm(real_rows, axis=0)
+    real_equations = np.concatenate([weighted_columns.real, weighted_columns.imag])
+    column_scale = np.linalg.norm(real_equations, axis=0)
     weighted_response = exact_response * point_weights / response_size
     fit_target = np.concatenate([weighted_response.real, weighted_response.imag])
     output_coefficients = np.zeros(basis_columns.shape[1])
     output_coefficients[fitted_columns] = (
-        np.linalg.lstsq(real_rows / column_scale, fit_target, rcond=_SINGULAR_VALUE_CUTOFF)[0]
+        np.linalg.lstsq(real_equations / column_scale, fit_target, rcond=_SINGULAR_VALUE_CUTOFF)[0]
         / column_scale
     )
     # The rms, not the largest error, since a response has zeros of its own.
-    within_band = point_weights == 1
+    is_within_band = point_weights == 1
     relative_residual = ((basis_columns @ output_coefficients - exact_response) / response_size)[
-        within_band
+        is_within_band
     ]
     rms_error = float(np.sqrt(np.mean(np.abs(relative_residual) ** 2)))
-    if not rms_error <= _MAX_OUTPUT_ERROR:
+    if not rms_error <= _MAX_RELATIVE_OUTPUT_ERROR:
         raise RealisationError(
             f"A response of the beam is realised with a relative error of {rms_error:.1e} (rms); "
-            f"{_MAX_OUTPUT_ERROR:.1e} is accepted."
+            f"{_MAX_RELATIVE_OUTPUT_ERROR:.1e} is accepted."
         )
     inertia, viscosity, stiffness = output_coefficients[-3:].tolist()
     return StateOutput(output_coefficients[:-3], inertia, viscosity, stiffness)
@@ -221,7 +221,7 @@ def _basis_functions(s: ComplexArray, poles: ComplexArray) -> ComplexArray:
 
 
 def realise(
-    plant: Plant, *, max_relative_error: float = 1e-3, modes_of: Beam | None = None
+    plant: Plant, *, max_relative_error: float = 1e-3, mode_selection_beam: Beam | None = None
 ) -> Realisation:
     """Fit a finite-dimensional state space to the exact model of the beam.
 
@@ -231,7 +231,7 @@ def realise(
         Beam with its damping and ends. The torque channel is not used.
     max_relative_error
         Largest acceptable relative error over `ERROR_BAND_HZ`.
-    modes_of
+    mode_selection_beam
         A slightly stiffer or softer beam whose modes determine the realised ones, so that both
         realisations have the same number of states. None: the beam itself.
 
@@ -241,7 +241,7 @@ def realise(
         If the error is larger (the message states it); if the realisation would make a
         frictionless motor unstable; if the exact beam itself is not passive: negative
         coefficients, orders outside 0…2; if the beam has more than 300 modes to realise; or if it
-        does not have the modes of `modes_of`.
+        does not have the modes of `mode_selection_beam`.
 
     Examples
     --------
@@ -258,7 +258,9 @@ def realise(
     """
     beam, damping = plant.beam, plant.damping
     _check_passive(damping)
-    poles, modes = _realised_poles(plant, beam if modes_of is None else modes_of)
+    poles, modes = _realised_poles(
+        plant, beam if mode_selection_beam is None else mode_selection_beam
+    )
     zeros = _zeros_in_band(plant)
     poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
 
@@ -304,26 +306,31 @@ def _check_passive(damping: Damping) -> None:
         )
 
 
-def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[ComplexArray, NDArray[np.intp]]:
+def _realised_poles(
+    plant: Plant, mode_selection_beam: Beam
+) -> tuple[ComplexArray, NDArray[np.intp]]:
     """Return the realisation's poles in rad/s and the index of each pole's mode.
 
-    The poles up to 1.2 kHz are ordered as in `Realisation.poles_rad_s`; `modes_of` is the beam
-    that determines which modes are included.
+    The poles up to 1.2 kHz are ordered as in `Realisation.poles_rad_s`; `mode_selection_beam` is
+    the beam that determines which modes are included.
     """
-    highest_k_fourth = (2 * np.pi * _HIGHEST_MODE_HZ) ** 2 * modes_of.density_over_stiffness
+    highest_k_fourth = (
+        2 * np.pi * _HIGHEST_MODE_HZ
+    ) ** 2 * mode_selection_beam.density_over_stiffness
     # Damping may lower the highest modes, so a few more are computed than the undamped count.
-    mode_count = int(1.25 * highest_k_fourth**0.25 * modes_of.length_m / np.pi) + 3
+    mode_count = int(1.25 * highest_k_fourth**0.25 * mode_selection_beam.length_m / np.pi) + 3
     if mode_count > _MAX_MODES:
         raise RealisationError(
-            f"{modes_of} has about {mode_count} modes below {_HIGHEST_MODE_HZ:g} Hz, more than the "
-            f"{_MAX_MODES} that are realised; check the units of its length, density and stiffness."
+            f"{mode_selection_beam} has about {mode_count} modes below {_HIGHEST_MODE_HZ:g} Hz, "
+            f"more than the {_MAX_MODES} that are realised; check the units of its length, density "
+            "and stiffness."
         )
     eigenvalues = clamped_free_eigenvalues(mode_count)
     pole_pairs = plant.poles(eigenvalues)
-    if modes_of == plant.beam:
+    if mode_selection_beam == plant.beam:
         is_selected = _select_poles(pole_pairs)
     else:
-        is_selected = _select_poles(replace(plant, beam=modes_of).poles(eigenvalues))
+        is_selected = _select_poles(replace(plant, beam=mode_selection_beam).poles(eigenvalues))
     is_oscillating = pole_pairs[:, 0].imag > 0
     # A pair may have ceased, or begun, to oscillate; one pole alone cannot.
     if (
@@ -331,16 +338,16 @@ def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[ComplexArray, NDArray
         or (is_oscillating & (is_selected.sum(axis=1) == 1)).any()
     ):
         raise RealisationError(
-            f"{plant.beam} with {plant.damping} does not have the modes of {modes_of}."
+            f"{plant.beam} with {plant.damping} does not have the modes of {mode_selection_beam}."
         )
-    upper_rows = np.flatnonzero(is_oscillating & is_selected[:, 0])
-    over_damped = is_selected & ~is_oscillating[:, None]
-    cut_modes = np.full(_BRANCH_CUT_POLES_RAD_S.size, -1)
+    oscillating_modes = np.flatnonzero(is_oscillating & is_selected[:, 0])
+    is_over_damped = is_selected & ~is_oscillating[:, None]
+    branch_cut_modes = np.full(_BRANCH_CUT_POLES_RAD_S.size, -1)
     return (
         np.concatenate(
-            [pole_pairs[upper_rows, 0], pole_pairs[over_damped], _BRANCH_CUT_POLES_RAD_S]
+            [pole_pairs[oscillating_modes, 0], pole_pairs[is_over_damped], _BRANCH_CUT_POLES_RAD_S]
         ),
-        np.concatenate([upper_rows, np.nonzero(over_damped)[0], cut_modes]),
+        np.concatenate([oscillating_modes, np.nonzero(is_over_damped)[0], branch_cut_modes]),
     )
 
 
@@ -349,11 +356,15 @@ def _select_poles(pole_pairs: ComplexArray) -> NDArray[np.bool_]:
     is_oscillating = pole_pairs[:, 0].imag > 0
     mode_indices = np.flatnonzero(is_oscillating)
     upper_poles = pole_pairs[mode_indices, 0]
-    within_band = np.abs(upper_poles) < 2 * np.pi * _FIT_BAND_HZ[1]
-    lightly_damped = within_band | (-upper_poles.real < _HEAVY_DAMPING_RATIO * np.abs(upper_poles))
-    mode_indices, upper_poles = mode_indices[lightly_damped], upper_poles[lightly_damped]
-    above_band = np.flatnonzero(upper_poles.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
-    mode_indices = mode_indices[: above_band[0] + 1] if above_band.size else mode_indices
+    is_within_band = np.abs(upper_poles) < 2 * np.pi * _FIT_BAND_HZ[1]
+    is_lightly_damped = is_within_band | (
+        -upper_poles.real < _MAX_MODAL_DAMPING_RATIO * np.abs(upper_poles)
+    )
+    mode_indices, upper_poles = mode_indices[is_lightly_damped], upper_poles[is_lightly_damped]
+    indices_above_band = np.flatnonzero(upper_poles.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
+    mode_indices = (
+        mode_indices[: indices_above_band[0] + 1] if indices_above_band.size else mode_indices
+    )
     is_selected = ~is_oscillating[:, None] & (np.abs(pole_pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
     is_selected[mode_indices] = True
     return is_selected
@@ -387,14 +398,16 @@ def _fit_grid(poles_and_zeros: ComplexArray) -> tuple[RealArray, RealArray]:
         ]
     )
     frequency_hz = np.concatenate([band_hz, tails_hz])
-    point_weights = np.concatenate([np.ones(band_hz.size), np.full(tails_hz.size, _TAIL_WEIGHT)])
+    point_weights = np.concatenate(
+        [np.ones(band_hz.size), np.full(tails_hz.size, _FIT_TAIL_WEIGHT)]
+    )
     return 2 * np.pi * frequency_hz, point_weights
 
 
-def _grid_around(poles_and_zeros: ComplexArray, points: int) -> RealArray:
+def _grid_around(poles_and_zeros: ComplexArray, points_per_root: int) -> RealArray:
     """Return a grid of frequencies (Hz) within three half-widths of each pole or zero."""
     half_width = np.maximum(-poles_and_zeros.real, 1e-4 * poles_and_zeros.imag)
-    width_offsets = np.linspace(-3, 3, points)
+    width_offsets = np.linspace(-3, 3, points_per_root)
     frequency_hz: RealArray = (
         poles_and_zeros.imag[:, None] + half_width[:, None] * width_offsets
     ).ravel() / (2 * np.pi)
@@ -410,18 +423,18 @@ def _fit_coefficients(equation_columns: ComplexArray, equation_target: ComplexAr
     column_scale = np.linalg.norm(real_columns, axis=0)
     q, r = np.linalg.qr(real_columns / column_scale)
     rotated_target = q.T @ np.concatenate([equation_target.real, equation_target.imag])
-    free_columns = np.arange(real_columns.shape[1])
+    unconstrained_columns = np.arange(real_columns.shape[1])
     while True:
         scaled_solution = np.zeros(real_columns.shape[1])
-        scaled_solution[free_columns] = np.linalg.lstsq(
-            r[:, free_columns], rotated_target, rcond=_SINGULAR_VALUE_CUTOFF
+        scaled_solution[unconstrained_columns] = np.linalg.lstsq(
+            r[:, unconstrained_columns], rotated_target, rcond=_SINGULAR_VALUE_CUTOFF
         )[0]
         direct_terms = scaled_solution[-3:]
         if (direct_terms >= 0).all():
-            scaled: RealArray = scaled_solution / column_scale
-            return scaled
-        free_columns = free_columns[
-            free_columns != real_columns.shape[1] - 3 + np.argmin(direct_terms)
+            solution: RealArray = scaled_solution / column_scale
+            return solution
+        unconstrained_columns = unconstrained_columns[
+            unconstrained_columns != real_columns.shape[1] - 3 + np.argmin(direct_terms)
         ]
 
 
@@ -449,7 +462,7 @@ def _far_from_poles_and_zeros(
     """
     poles_and_zeros = np.concatenate([poles, zeros])
     distance = np.abs(1j * omega[:, None] - poles_and_zeros).min(axis=1)
-    is_far: NDArray[np.bool_] = distance > _MIN_RELATIVE_DISTANCE * omega
+    is_far: NDArray[np.bool_] = distance > _MIN_RELATIVE_ROOT_DISTANCE * omega
     return is_far
 
 
@@ -460,14 +473,14 @@ def _build_realisation(
     upper_poles, real_poles = poles[poles.imag > 0], poles[poles.imag == 0].real
     n = 2 * upper_poles.size + real_poles.size
     a = np.zeros((n, n))
-    upper_rows = np.arange(0, 2 * upper_poles.size, 2)
-    a[upper_rows, upper_rows] = a[upper_rows + 1, upper_rows + 1] = upper_poles.real
-    a[upper_rows, upper_rows + 1] = upper_poles.imag
-    a[upper_rows + 1, upper_rows] = -upper_poles.imag
-    real_rows = np.arange(2 * upper_poles.size, n)
-    a[real_rows, real_rows] = real_poles
+    pair_rows = np.arange(0, 2 * upper_poles.size, 2)
+    a[pair_rows, pair_rows] = a[pair_rows + 1, pair_rows + 1] = upper_poles.real
+    a[pair_rows, pair_rows + 1] = upper_poles.imag
+    a[pair_rows + 1, pair_rows] = -upper_poles.imag
+    real_pole_rows = np.arange(2 * upper_poles.size, n)
+    a[real_pole_rows, real_pole_rows] = real_poles
     b = np.ones(n)
-    b[upper_rows + 1] = 0.0
+    b[pair_rows + 1] = 0.0
     inertia, viscosity, stiffness = (float(coefficient) for coefficient in coefficients[-3:])
     return Realisation(
         a, b, coefficients[:-3], inertia, viscosity, stiffness, relative_error, poles, modes
@@ -500,38 +513,38 @@ class CoupledModel:
     """State matrix, shape (n, n)."""
     b: RealArray
     """Input vector of the torque on the shaft, shape (n,)."""
-    angle: RealArray
+    angle_output_row: RealArray
     """Output row of the angle in rad, shape (n,)."""
-    velocity: RealArray
+    velocity_output_row: RealArray
     """Output row of the angular velocity in rad/s, shape (n,)."""
-    acceleration: RealArray
+    acceleration_output_row: RealArray
     """Output row of the angular acceleration in rad/s², shape (n,).
 
     The torque on the shaft adds `acceleration_per_torque` times τ."""
     acceleration_per_torque: float
     """Angular acceleration per torque on the shaft, in rad/(s² N·m)."""
-    beam_torque: RealArray
+    beam_torque_output_row: RealArray
     """Output row of the torque Γ on the beam in N·m, shape (n,).
 
     The torque on the shaft adds `beam_torque_per_torque` times τ."""
     beam_torque_per_torque: float
     """Fraction of the shaft's torque that acts on the beam without delay."""
-    sensor_torque: RealArray
+    sensor_torque_output_row: RealArray
     """Output row of the torque at a sensor between motor and clamp in N·m, shape (n,).
 
     It is ``Γ + J_tool θ''``; the torque on the shaft adds `sensor_torque_per_torque` times τ."""
     sensor_torque_per_torque: float
     """Fraction of the shaft's torque that acts on the sensor without delay."""
-    sensed_torque: RealArray | None = None
+    sensed_torque_output_row: RealArray | None = None
     """Output row of the torque after the sensor's filter in N·m, shape (n,); None without filter.
     """
-    shear: RealArray = field(default_factory=lambda: np.zeros(0))
+    shear_output_row: RealArray = field(default_factory=lambda: np.zeros(0))
     """Output row of the motor's force on the beam in N, shape (n,).
 
     The torque on the shaft adds `shear_per_torque` times τ."""
     shear_per_torque: float = 0.0
     """Force on the beam per torque on the shaft that acts without delay, in 1/m."""
-    sensed_shear: RealArray | None = None
+    sensed_shear_output_row: RealArray | None = None
     """Output row of the shear force after the sensor's filter in N, shape (n,); None without
     filter."""
 
@@ -551,36 +564,36 @@ def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledMod
         1, or 2 (Butterworth).
     """
     n, omega = model.b.size, 2 * math.pi * corner_hz
-    extra_states = 2 * order
-    a = np.zeros((n + extra_states, n + extra_states))
-    b = np.zeros(n + extra_states)
+    filter_state_count = 2 * order
+    a = np.zeros((n + filter_state_count, n + filter_state_count))
+    b = np.zeros(n + filter_state_count)
     a[:n, :n], b[:n] = model.a, model.b
-    filtered_outputs = (
-        (n, model.sensor_torque, model.sensor_torque_per_torque),
-        (n + order, model.shear, model.shear_per_torque),
+    filtered_output_rows = (
+        (n, model.sensor_torque_output_row, model.sensor_torque_per_torque),
+        (n + order, model.shear_output_row, model.shear_per_torque),
     )
-    for first_state, row, per_torque in filtered_outputs:
-        last_state = first_state + order - 1
+    for first_state_index, row, per_torque in filtered_output_rows:
+        last_state_index = first_state_index + order - 1
         # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
-        a[last_state, :n] = omega * row
-        b[last_state] = omega * per_torque
-        a[last_state, first_state] = -omega
+        a[last_state_index, :n] = omega * row
+        b[last_state_index] = omega * per_torque
+        a[last_state_index, first_state_index] = -omega
         if order == 2:
-            a[first_state, last_state] = omega
-            a[last_state, last_state] = -math.sqrt(2) * omega
-    no_output = np.zeros(extra_states)
+            a[first_state_index, last_state_index] = omega
+            a[last_state_index, last_state_index] = -math.sqrt(2) * omega
+    zero_columns = np.zeros(filter_state_count)
     return replace(
         model,
         a=a,
         b=b,
-        angle=np.append(model.angle, no_output),
-        velocity=np.append(model.velocity, no_output),
-        acceleration=np.append(model.acceleration, no_output),
-        beam_torque=np.append(model.beam_torque, no_output),
-        sensor_torque=np.append(model.sensor_torque, no_output),
-        sensed_torque=np.eye(1, n + extra_states, n)[0],
-        shear=np.append(model.shear, no_output),
-        sensed_shear=np.eye(1, n + extra_states, n + order)[0],
+        angle_output_row=np.append(model.angle_output_row, zero_columns),
+        velocity_output_row=np.append(model.velocity_output_row, zero_columns),
+        acceleration_output_row=np.append(model.acceleration_output_row, zero_columns),
+        beam_torque_output_row=np.append(model.beam_torque_output_row, zero_columns),
+        sensor_torque_output_row=np.append(model.sensor_torque_output_row, zero_columns),
+        sensed_torque_output_row=np.eye(1, n + filter_state_count, n)[0],
+        shear_output_row=np.append(model.shear_output_row, zero_columns),
+        sensed_shear_output_row=np.eye(1, n + filter_state_count, n + order)[0],
     )
 
 
@@ -607,8 +620,8 @@ def couple(
     shear
         Base shear of the beam as an output of `realisation`, or None to omit the shear force.
     """
-    beam_states = 0 if realisation is None else realisation.b.size
-    n = 2 + beam_states
+    beam_state_count = 0 if realisation is None else realisation.b.size
+    n = 2 + beam_state_count
     rigid_torque = np.zeros(n)  # Γ without the term D θ''
     direct_inertia = 0.0
     a = np.zeros((n, n))
@@ -637,15 +650,15 @@ def couple(
     return CoupledModel(
         a=a,
         b=b,
-        angle=angle_row,
-        velocity=velocity_row,
-        acceleration=acceleration_row,
+        angle_output_row=angle_row,
+        velocity_output_row=velocity_row,
+        acceleration_output_row=acceleration_row,
         acceleration_per_torque=1 / total_inertia,
-        beam_torque=rigid_torque + direct_inertia * acceleration_row,
+        beam_torque_output_row=rigid_torque + direct_inertia * acceleration_row,
         beam_torque_per_torque=direct_inertia / total_inertia,
-        sensor_torque=rigid_torque + sensed_inertia * acceleration_row,
+        sensor_torque_output_row=rigid_torque + sensed_inertia * acceleration_row,
         sensor_torque_per_torque=sensed_inertia / total_inertia,
-        shear=shear_row,
+        shear_output_row=shear_row,
         shear_per_torque=shear_per_acceleration / total_inertia,
     )
 
@@ -712,8 +725,8 @@ def _matrix_exponential(square_matrix: RealArray) -> RealArray:
     cases. scipy has the same function, but its import takes longer than the rest of a fast start.
     """
     matrix_norm = float(np.linalg.norm(square_matrix, 1))
-    squarings = max(0, math.ceil(math.log2(matrix_norm / 5.37))) if matrix_norm > 0 else 0
-    x = square_matrix / 2.0**squarings
+    squaring_count = max(0, math.ceil(math.log2(matrix_norm / 5.37))) if matrix_norm > 0 else 0
+    x = square_matrix / 2.0**squaring_count
     x2 = x @ x
     x4 = x2 @ x2
     matrix_powers = np.stack([np.eye(len(x)), x2, x4, x2 @ x4])  # of x²: 0, 1, 2, 3
@@ -725,6 +738,6 @@ def _matrix_exponential(square_matrix: RealArray) -> RealArray:
     )
     odd_part = x @ odd_part
     matrix_exponential: RealArray = np.linalg.solve(even_part - odd_part, even_part + odd_part)
-    for _ in range(squarings):
+    for _ in range(squaring_count):
         matrix_exponential = matrix_exponential @ matrix_exponential
     return matrix_exponential

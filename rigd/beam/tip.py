@@ -136,7 +136,7 @@ def _tip_motion_from_rest(
     )
     s = transform.s
     # The angle stays at its final value: a jump back would ring at the last samples.
-    deflection_spectrum = transform.forward(angle_rad, hold=True)
+    deflection_spectrum = transform.forward(angle_rad, holds_last_value=True)
     tip_slope, tip_speed = np.empty((2, s.size), dtype=np.complex128)
     # Block by block and without copies: these arrays have the record's length.
     for block_start in range(0, s.size, _BLOCK_POINTS):

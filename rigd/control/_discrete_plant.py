@@ -101,13 +101,13 @@ class DiscretePlant:
         for command_index in range(1, command_count):
             extended_matrix[n + command_index, n + command_index - 1] = 1.0
 
-        angle_quantity = (coupled_plant.angle, 0.0)
+        angle_quantity = (coupled_plant.angle_output_row, 0.0)
         sensor_torque_quantity = (
-            coupled_plant.sensor_torque,
+            coupled_plant.sensor_torque_output_row,
             coupled_plant.sensor_torque_per_torque,
         )
         self.angle = reading_row(*angle_quantity)[:state_size]
-        self.velocity = reading_row(coupled_plant.velocity, 0.0)[:state_size]
+        self.velocity = reading_row(coupled_plant.velocity_output_row, 0.0)[:state_size]
         self.sensor_torque = reading_row(*sensor_torque_quantity)[:state_size]
 
         measured_rows = []

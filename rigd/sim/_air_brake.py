@@ -17,7 +17,7 @@ from rigd.beam import (
     Damping,
     DragGrid,
     clamped_free_eigenvalues,
-    mode_mean,
+    mode_shape_mean,
 )
 from rigd.beam.realisation import CoupledModel, Realisation
 
@@ -73,7 +73,7 @@ class AirBrake:
         poles = realisation.poles_rad_s[realisation.poles_rad_s.imag > 0][:_DRAG_MODE_COUNT]
         mode_count = poles.size
         self._poles = poles
-        self._grid = drag_grid = DragGrid.of(beam, mode_count, _DRAG_POINT_COUNT)
+        self._grid = drag_grid = DragGrid.along_beam(beam, mode_count, _DRAG_POINT_COUNT)
         k_fourth = (clamped_free_eigenvalues(mode_count) / beam.length_m) ** 4
         inertial_terms = beam.density_over_stiffness * poles**2
         external_terms = damping.gamma * poles**damping.lambda_
@@ -82,16 +82,20 @@ class AirBrake:
         derivatives_at_poles = (
             2 * inertial_terms + damping.lambda_ * external_terms + damping.alpha * internal_terms
         ) / poles
-        leverage_m2 = beam.length_m * drag_grid.leverage_m
-        self._torque_of_mode = _real_part_rows(leverage_m2 * load_terms / derivatives_at_poles).sum(
-            axis=0
+        shape_moment_m2 = beam.length_m * drag_grid.shape_moment_m
+        self._torque_of_mode = _real_part_rows(
+            shape_moment_m2 * load_terms / derivatives_at_poles
+        ).sum(axis=0)
+        self._torque_per_force_m2 = (
+            shape_moment_m2 @ drag_grid.modal_force_matrix - drag_grid.moment_weights_m2
         )
-        self._torque_per_force_m2 = leverage_m2 @ drag_grid.to_modes - drag_grid.to_moment
-        mean_deflections_m = beam.length_m * mode_mean(mode_count)
+        mean_deflections_m = beam.length_m * mode_shape_mean(mode_count)
         self._shear_of_mode = _real_part_rows(
             mean_deflections_m * load_terms / derivatives_at_poles
         ).sum(axis=0)
-        self._shear_per_force_m = mean_deflections_m @ drag_grid.to_modes - drag_grid.weight_m
+        self._shear_per_force_m = (
+            mean_deflections_m @ drag_grid.modal_force_matrix - drag_grid.quadrature_weight_m
+        )
 
         coupled_state_count = 2 + realisation.b.size
         self.speed_rows: RealArray = np.zeros(
@@ -99,7 +103,7 @@ class AirBrake:
         )
         self.speed_rows[:, 1] = drag_grid.x_m
         modal_rows = _real_part_rows(
-            -drag_grid.leverage_m * load_terms / derivatives_at_poles / poles
+            -drag_grid.shape_moment_m * load_terms / derivatives_at_poles / poles
         )
         self.speed_rows[:, 2 : 2 + 2 * mode_count] = drag_grid.shapes.T @ modal_rows
         force_rows = _real_part_rows(poles / derivatives_at_poles / beam.bending_stiffness_n_m2)
@@ -134,7 +138,7 @@ class AirBrake:
         a[pole_state_indices + 1, pole_state_indices] = -self._poles.imag
         force_input = np.zeros((n + added_state_count, _DRAG_POINT_COUNT))
         force_input[:n] = -np.outer(model.b, self._torque_per_force_m2)
-        force_input[pole_state_indices] = self._grid.to_modes
+        force_input[pole_state_indices] = self._grid.modal_force_matrix
 
         def extended_row(
             model_row: RealArray, output_per_torque: float = 0.0, direct_effect: float = 0.0
@@ -147,13 +151,19 @@ class AirBrake:
             model,
             a=a,
             b=np.concatenate([model.b, np.zeros(added_state_count)]),
-            angle=extended_row(model.angle),
-            velocity=extended_row(model.velocity),
-            acceleration=extended_row(model.acceleration, model.acceleration_per_torque),
-            beam_torque=extended_row(model.beam_torque, model.beam_torque_per_torque, 1.0),
-            sensor_torque=extended_row(model.sensor_torque, model.sensor_torque_per_torque, 1.0),
-            shear=np.append(
-                model.shear,
+            angle_output_row=extended_row(model.angle_output_row),
+            velocity_output_row=extended_row(model.velocity_output_row),
+            acceleration_output_row=extended_row(
+                model.acceleration_output_row, model.acceleration_per_torque
+            ),
+            beam_torque_output_row=extended_row(
+                model.beam_torque_output_row, model.beam_torque_per_torque, 1.0
+            ),
+            sensor_torque_output_row=extended_row(
+                model.sensor_torque_output_row, model.sensor_torque_per_torque, 1.0
+            ),
+            shear_output_row=np.append(
+                model.shear_output_row,
                 self._shear_of_mode - model.shear_per_torque * self._torque_of_mode,
             ),
         )

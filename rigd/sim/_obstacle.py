@@ -107,7 +107,7 @@ class AttachedObstacles:
                 realisation,
                 partial(_displacement_per_angle, beam, damping, x),
                 inertial=False,
-                small=_SMALL_DISPLACEMENT_RATIO * x,
+                response_floor=_SMALL_DISPLACEMENT_RATIO * x,
             )
             for x in positions_m.tolist()
         ]
@@ -168,16 +168,20 @@ class AttachedObstacles:
             model,
             a=a,
             b=np.append(model.b, np.zeros(added_state_count)),
-            angle=np.append(model.angle, np.zeros(added_state_count)),
-            velocity=np.append(model.velocity, np.zeros(added_state_count)),
-            acceleration=np.append(model.acceleration, -model.acceleration_per_torque * torque_row),
-            beam_torque=np.append(
-                model.beam_torque, (1 - model.beam_torque_per_torque) * torque_row
+            angle_output_row=np.append(model.angle_output_row, np.zeros(added_state_count)),
+            velocity_output_row=np.append(model.velocity_output_row, np.zeros(added_state_count)),
+            acceleration_output_row=np.append(
+                model.acceleration_output_row, -model.acceleration_per_torque * torque_row
             ),
-            sensor_torque=np.append(
-                model.sensor_torque, (1 - model.sensor_torque_per_torque) * torque_row
+            beam_torque_output_row=np.append(
+                model.beam_torque_output_row, (1 - model.beam_torque_per_torque) * torque_row
             ),
-            shear=np.append(model.shear, shear_row - model.shear_per_torque * torque_row),
+            sensor_torque_output_row=np.append(
+                model.sensor_torque_output_row, (1 - model.sensor_torque_per_torque) * torque_row
+            ),
+            shear_output_row=np.append(
+                model.shear_output_row, shear_row - model.shear_per_torque * torque_row
+            ),
         )
         return extended_coupled_model, force_input
 
@@ -264,16 +268,18 @@ class AttachedObstacles:
         effect_matrix = np.vstack(
             [
                 decayed_states[::-1].transpose(1, 0, 2).reshape(n, -1),
-                forces_effect_on_output(model.angle, zero_row, period_s),
-                forces_effect_on_output(model.velocity, zero_row, period_s),
-                forces_effect_on_output(model.sensor_torque, direct_sensor_torque, period_s),
-                forces_effect_on_output(holding_torque_row, self._direct_rows[-2], period_s),
-                forces_effect_on_output(model.shear, direct_shear, period_s),
-                forces_effect_on_output(model.angle, zero_row, angle_instant_s),
+                forces_effect_on_output(model.angle_output_row, zero_row, period_s),
+                forces_effect_on_output(model.velocity_output_row, zero_row, period_s),
                 forces_effect_on_output(
-                    model.sensor_torque, direct_sensor_torque, torque_instant_s
+                    model.sensor_torque_output_row, direct_sensor_torque, period_s
                 ),
-                forces_effect_on_output(model.shear, direct_shear, torque_instant_s),
+                forces_effect_on_output(holding_torque_row, self._direct_rows[-2], period_s),
+                forces_effect_on_output(model.shear_output_row, direct_shear, period_s),
+                forces_effect_on_output(model.angle_output_row, zero_row, angle_instant_s),
+                forces_effect_on_output(
+                    model.sensor_torque_output_row, direct_sensor_torque, torque_instant_s
+                ),
+                forces_effect_on_output(model.shear_output_row, direct_shear, torque_instant_s),
             ]
         )
         return SubstepMatrices(

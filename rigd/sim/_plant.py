@@ -185,14 +185,14 @@ class SimulatedPlant:
             free_shaft_drag_effect = constant_force_effect(
                 free_shaft_model,
                 free_input,
-                locked_shaft_model.sensor_torque,
+                locked_shaft_model.sensor_torque_output_row,
                 period_s,
                 *switch_and_sample_instants_s[1:],
             )
             locked_shaft_drag_effect = constant_force_effect(
                 locked_shaft_model,
                 locked_input,
-                locked_shaft_model.sensor_torque,
+                locked_shaft_model.sensor_torque_output_row,
                 period_s,
                 *switch_and_sample_instants_s[1:],
             )
@@ -219,7 +219,7 @@ class SimulatedPlant:
                 self._contact.substep_matrices(
                     coupled_model,
                     force_input,
-                    locked_shaft_model.sensor_torque,
+                    locked_shaft_model.sensor_torque_output_row,
                     *switch_and_sample_instants_s,
                     friction_effect=friction_effect[:n],
                 )

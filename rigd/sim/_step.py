@@ -40,12 +40,12 @@ _SAME_INSTANT_PERIODS = 1e-9
 
 
 def beam_and_coupled_models(
-    parameters: RigParameters, simulation: Simulation, mode_reference_beam: Beam | None = None
+    parameters: RigParameters, simulation: Simulation, mode_selection_beam: Beam | None = None
 ) -> tuple[Realisation, CoupledModel, CoupledModel]:
     """Return the realisation of the beam, and the models of the beam on a free and a locked shaft.
 
     The beam of `parameters` is simulated, with tip mass, clamp compliance and sensor filter of
-    `simulation`. `mode_reference_beam` is the argument `modes_of` of
+    `simulation`. `mode_selection_beam` is the argument `modes_of` of
     :func:`rigd.beam.realisation.realise`.
     """
     plant = Plant(
@@ -54,12 +54,12 @@ def beam_and_coupled_models(
         tip_mass_kg=simulation.tip_mass_kg,
         root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
     )
-    beam_realisation = realise(plant, modes_of=mode_reference_beam)
+    beam_realisation = realise(plant, mode_selection_beam=mode_selection_beam)
     attach_beam = partial(
         couple,
         beam_realisation,
         tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
-        shear=state_output(beam_realisation, plant.shear, inertial=True),
+        shear=state_output(beam_realisation, plant.shear, has_inertial_term=True),
     )
     free_shaft_model = attach_beam(
         motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
@@ -93,11 +93,14 @@ def free_and_locked_steps(
     """
     n = free_shaft_model.b.size
     free_shaft_matrix = _step_matrix(
-        free_shaft_model, locked_shaft_model.sensor_torque, period_s, *switch_and_sample_instants_s
+        free_shaft_model,
+        locked_shaft_model.sensor_torque_output_row,
+        period_s,
+        *switch_and_sample_instants_s,
     )
     locked_shaft_matrix = _step_matrix(
         locked_shaft_model,
-        locked_shaft_model.sensor_torque,
+        locked_shaft_model.sensor_torque_output_row,
         period_s,
         *switch_and_sample_instants_s,
     )
@@ -138,9 +141,7 @@ def drifted_step_arrays(
         )
     except RealisationError as error:
         raise RealisationError(
-            "simulation.stiffness_drift_per_s: this beam cannot be simulated at "
-            f"{stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. "
-            f"{error}"
+            f"simulation.stiffness_drift_per_s: this beam cannot be simulated at {stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. {error}"
         ) from error
     free_shaft_model, locked_shaft_model = (
         with_modal_displacements(coupled_model, drifted_realisation, initial_realisation)
@@ -192,11 +193,11 @@ def _step_matrix(
 
     def torque_at(instant_s: float) -> RealArray:
         return row_with_immediate_effect(
-            model.sensor_torque, model.sensor_torque_per_torque, instant_s
+            model.sensor_torque_output_row, model.sensor_torque_per_torque, instant_s
         )
 
     def shear_at(instant_s: float) -> RealArray:
-        return row_with_immediate_effect(model.shear, model.shear_per_torque, instant_s)
+        return row_with_immediate_effect(model.shear_output_row, model.shear_per_torque, instant_s)
 
     def row_with_immediate_effect(
         state_row: RealArray, output_per_torque: float, instant_s: float
@@ -218,13 +219,13 @@ def _step_matrix(
         [
             *_output_rows(model, end_state_rows, torque_at(period_s), holding_torque_row),
             shear_at(period_s),
-            model.angle @ state_at(angle_instant_s),
+            model.angle_output_row @ state_at(angle_instant_s),
             torque_at(torque_instant_s)
-            if model.sensed_torque is None
-            else model.sensed_torque @ state_at(torque_instant_s),
+            if model.sensed_torque_output_row is None
+            else model.sensed_torque_output_row @ state_at(torque_instant_s),
             shear_at(torque_instant_s)
-            if model.sensed_shear is None
-            else model.sensed_shear @ state_at(torque_instant_s),
+            if model.sensed_shear_output_row is None
+            else model.sensed_shear_output_row @ state_at(torque_instant_s),
         ]
     )
 
@@ -238,8 +239,8 @@ def _output_rows(
     """Return the step matrix's first rows: state after a period, angle, speed and both torques."""
     return (
         end_state_rows,
-        model.angle @ end_state_rows,
-        model.velocity @ end_state_rows,
+        model.angle_output_row @ end_state_rows,
+        model.velocity_output_row @ end_state_rows,
         torque_row,
         holding_torque_row @ end_state_rows,
     )
@@ -266,10 +267,12 @@ def constant_force_effect(
     end_states = state_at(period_s)
     return np.vstack(
         [
-            *_output_rows(model, end_states, model.sensor_torque @ end_states, holding_torque_row),
-            model.shear @ end_states,
-            model.angle @ state_at(angle_instant_s),
-            model.sensor_torque @ state_at(torque_instant_s),
-            model.shear @ state_at(torque_instant_s),
+            *_output_rows(
+                model, end_states, model.sensor_torque_output_row @ end_states, holding_torque_row
+            ),
+            model.shear_output_row @ end_states,
+            model.angle_output_row @ state_at(angle_instant_s),
+            model.sensor_torque_output_row @ state_at(torque_instant_s),
+            model.shear_output_row @ state_at(torque_instant_s),
         ]
     )

@@ -139,14 +139,18 @@ def with_modal_displacements(
         model,
         a=displacements_per_state @ model.a @ states_per_displacement,
         b=displacements_per_state @ model.b,
-        angle=transformed_row(model.angle),
-        velocity=transformed_row(model.velocity),
-        acceleration=transformed_row(model.acceleration),
-        beam_torque=transformed_row(model.beam_torque),
-        sensor_torque=transformed_row(model.sensor_torque),
-        sensed_torque=None if model.sensed_torque is None else transformed_row(model.sensed_torque),
-        shear=transformed_row(model.shear),
-        sensed_shear=None if model.sensed_shear is None else transformed_row(model.sensed_shear),
+        angle_output_row=transformed_row(model.angle_output_row),
+        velocity_output_row=transformed_row(model.velocity_output_row),
+        acceleration_output_row=transformed_row(model.acceleration_output_row),
+        beam_torque_output_row=transformed_row(model.beam_torque_output_row),
+        sensor_torque_output_row=transformed_row(model.sensor_torque_output_row),
+        sensed_torque_output_row=None
+        if model.sensed_torque_output_row is None
+        else transformed_row(model.sensed_torque_output_row),
+        shear_output_row=transformed_row(model.shear_output_row),
+        sensed_shear_output_row=None
+        if model.sensed_shear_output_row is None
+        else transformed_row(model.sensed_shear_output_row),
     )
 
 

@@ -37,7 +37,7 @@ def test_the_response_of_an_oscillator_does_not_wrap_round(transform):
 
 def test_held_signal_continues_its_last_value():
     transform = CausalTransform(4 * N, RATE_HZ, 9.0)
-    moved = transform.inverse(transform.forward(T_S, hold=True), 3 * N)
+    moved = transform.inverse(transform.forward(T_S, holds_last_value=True), 3 * N)
     assert moved[:N] == pytest.approx(T_S, abs=1e-9)
     assert moved[N:] == pytest.approx(T_S[-1], abs=1e-9)
 

@@ -27,12 +27,12 @@ def test_rows_are_the_mechanics_of_motor_clamp_and_beam(realisation, tool_inerti
     g = 0 if realisation is None else realisation.transfer(s)
     angle = 1 / ((2e-3 + tool_inertia) * s**2 + 0.02 * s + g)
     for row, direct, expected in (
-        (model.angle, 0, angle),
-        (model.velocity, 0, s * angle),
-        (model.acceleration, model.acceleration_per_torque, s**2 * angle),
-        (model.beam_torque, model.beam_torque_per_torque, g * angle),
+        (model.angle_output_row, 0, angle),
+        (model.velocity_output_row, 0, s * angle),
+        (model.acceleration_output_row, model.acceleration_per_torque, s**2 * angle),
+        (model.beam_torque_output_row, model.beam_torque_per_torque, g * angle),
         (
-            model.sensor_torque,
+            model.sensor_torque_output_row,
             model.sensor_torque_per_torque,
             (g + tool_inertia * s**2) * angle,
         ),

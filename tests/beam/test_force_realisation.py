@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from cases import further
 
-from rigd.beam import Beam, Damping, Plant, PointForceGrid, mode_mean, mode_shape, realise_force
+from rigd.beam import (
+    Beam,
+    Damping,
+    Plant,
+    PointForceGrid,
+    mode_shape,
+    mode_shape_mean,
+    realise_force,
+)
 from rigd.beam.realisation import RealisationError, realise, state_output
 
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
@@ -77,7 +85,7 @@ def test_displacement_as_output_of_the_states(damping, x_m):
     output = state_output(
         realisation,
         lambda s: PointForceGrid(s, BEAM, damping).displacement_per_angle(x_m),
-        inertial=False,
+        has_inertial_term=False,
     )
     assert output.output_per_acceleration == 0
     assert (
@@ -89,7 +97,9 @@ def test_displacement_as_output_of_the_states(damping, x_m):
 def test_shear_as_output_of_the_states(damping):
     realisation = realise(Plant(BEAM, damping))
     output = state_output(
-        realisation, lambda s: PointForceGrid(s, BEAM, damping).shear_per_angle(), inertial=True
+        realisation,
+        lambda s: PointForceGrid(s, BEAM, damping).shear_per_angle(),
+        has_inertial_term=True,
     )
     assert errors(realisation, output, damping, lambda grid: grid.shear_per_angle()) < 2e-3
 
@@ -120,7 +130,7 @@ def test_torque_of_a_force_is_the_displacement_of_an_angle(at_m):
     output = state_output(
         realisation,
         lambda s: PointForceGrid(s, BEAM, damping).displacement_per_angle(at_m),
-        inertial=False,
+        has_inertial_term=False,
     )
     displacement = with_output(realisation, output).transfer(s)
     torque = response(realise_force(BEAM, damping, at_m, np.array([at_m]), 1e4), s)[:, -2]
@@ -130,4 +140,4 @@ def test_torque_of_a_force_is_the_displacement_of_an_angle(at_m):
 def test_mean_of_the_mode_shapes():
     x = np.linspace(0, 1, 20001)
     means = [np.trapezoid(mode_shape(number, x), x) for number in range(1, 9)]
-    assert mode_mean(8) == pytest.approx(means, abs=1e-6)
+    assert mode_shape_mean(8) == pytest.approx(means, abs=1e-6)

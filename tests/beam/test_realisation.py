@@ -151,13 +151,16 @@ def test_number_of_states_does_not_depend_on_stiffness(fraction):
         for damping in (Damping(7.1e-5, 0.996, 0.055, 0.594), Damping(zeta=1.075e-3)):
             beam = Beam(length_m, 4.7e-3, 0.090275)
             other = Beam(length_m, 4.7e-3, fraction * 0.090275)
-            one, two = realise(Plant(beam, damping)), realise(Plant(other, damping), modes_of=beam)
+            one, two = (
+                realise(Plant(beam, damping)),
+                realise(Plant(other, damping), mode_selection_beam=beam),
+            )
             assert one.b.size == two.b.size
             assert np.array_equal(np.unique(one.modes), np.unique(two.modes))
             of_first = two.poles_rad_s[two.modes == 0] / one.poles_rad_s[one.modes == 0]
             assert of_first.imag == pytest.approx(0.0, abs=1e-2)
             assert of_first.real == pytest.approx(fraction**0.5, rel=1e-2)
-            own = realise(Plant(beam, damping), modes_of=beam)
+            own = realise(Plant(beam, damping), mode_selection_beam=beam)
             assert np.array_equal(own.c, one.c)
 
 
@@ -165,5 +168,5 @@ def test_modes_of_a_very_different_beam_are_refused():
     with pytest.raises(RealisationError, match="does not have the modes of"):
         realise(
             Plant(Beam(0.98, 4.7e-3, 0.090275), Damping(zeta=1.075e-3)),
-            modes_of=Beam(0.98, 4.7e-3, 0.9),
+            mode_selection_beam=Beam(0.98, 4.7e-3, 0.9),
         )

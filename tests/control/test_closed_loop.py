@@ -49,9 +49,9 @@ def run_tick_by_tick(model, reference_rad, torque_limit_nm=math.inf):
     torques = np.zeros(len(reference_rad))
     x, applied = np.zeros(coupled.b.size), 0.0
     for moment in range(moments):
-        angles[before + moment] = coupled.angle @ x
+        angles[before + moment] = coupled.angle_output_row @ x
         sensed[before + moment] = (
-            coupled.sensor_torque @ x + coupled.sensor_torque_per_torque * applied
+            coupled.sensor_torque_output_row @ x + coupled.sensor_torque_per_torque * applied
         )
         tick, part = divmod(moment, SUBSTEPS)
         if part == 0:

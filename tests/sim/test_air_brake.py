@@ -111,7 +111,7 @@ def test_the_air_s_torque_and_shear_are_those_of_its_force():
     outputs, forces = np.empty((ticks, 3)), np.empty((ticks, grid.x_m.size))
     for tick in range(ticks):
         outputs[tick] = plant.angle_rad, plant.coupling_torque_nm, plant.base_shear_n
-        forces[tick] = plant._air._forces[plant._air._newest] * grid.weight_m
+        forces[tick] = plant._air._forces[plant._air._newest] * grid.quadrature_weight_m
         plant.command(0.15 * np.sin(2 * np.pi * 1.7e-3 * tick) - 0.1 * plant.velocity_rad_s)
         plant.advance()
     padded = 1 << 15

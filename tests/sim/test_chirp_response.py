@@ -105,7 +105,7 @@ def closed_loop(model, substeps):
     first, second, last = unit[n : n + 3]
     angle = unit[0]
     torque = np.zeros(n + 4)  # at a tick: mean of the values on either side
-    torque[:n] = model.sensor_torque
+    torque[:n] = model.sensor_torque_output_row
     torque[n + 2 :] = 0.5 * model.sensor_torque_per_torque
 
     a, b = np.zeros((n + 4, n + 4)), np.zeros(n + 4)
@@ -124,7 +124,7 @@ def closed_loop(model, substeps):
         phi, gamma = propagator(model, substep * PERIOD_S / substeps)
         state = np.outer(gamma, last)
         state[:, :n] += phi
-        rows += [model.angle @ state, model.sensor_torque @ state]
+        rows += [model.angle_output_row @ state, model.sensor_torque_output_row @ state]
         rows[-1] += model.sensor_torque_per_torque * last
     return a, b, np.array(rows)
 
