@@ -90,7 +90,7 @@ def designed(
         reference_rad = np.concatenate([reference_rad, segment.reference_rad])
         angle_rad = np.concatenate([angle_rad, segment.angle_rad])
         left_s -= segment.reference_rad.size / RATE_HZ
-        if all(each.reached for each in segment.expected):
+        if all(each.reached for each in segment.expected_precisions):
             break
     return reference_rad, angle_rad, segments, slowest_s
 
@@ -123,7 +123,7 @@ def table(rig: RigPreview, slopes_rad: list[float], gate: Gate) -> None:
         for slope_rad in slopes_rad:
             reference, angle, segments, slowest_s = designed(rig, targets, 120.0, slope_rad)
             motion = tip_motion(Plant(LINK, DAMPING), angle, RATE_HZ)
-            done = all(each.reached for each in segments[-1].expected)
+            done = all(each.reached for each in segments[-1].expected_precisions)
             print(
                 f"{name:22} {motion.slope_rad:9.3f} {'' if done else '>'}"
                 f"{reference.size / RATE_HZ:10.1f} {len(segments):9} "

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from analysis.identify import Measurement, RecordFit, fit_record
 from analysis.models import STRUCTURES
 from rigd.beam import Plant, transfer
-from rigd.beam.tip import SMALL_SLOPE_RAD
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile
 from rigd.runner.planning import RigPreview
@@ -158,7 +158,7 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=6, help="of each kind")
     parser.add_argument("--plant", choices=PLANTS, action="append", help="only this one")
     parser.add_argument("--amplitude", type=float, action="append", help="of the narrow sweeps")
-    parser.add_argument("--tip-slope", type=float, default=SMALL_SLOPE_RAD, help="of them")
+    parser.add_argument("--tip-slope", type=float, default=SMALL_TIP_SLOPE_RAD, help="of them")
     parser.add_argument("--chirp-amplitude", type=float, default=0.025, help="of the peer")
     parser.add_argument("--widths", type=float, default=1.0, help="to either side of a mode")
     parser.add_argument("--engine", action="store_true", help="rigd run --fast, type VI only")

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from random_defects import scaled_smoothly
 
 from rigd.beam import Beam, Damping, Plant, modes
-from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD, tip_motion
 from rigd.excitation import BeamEstimate, chirp
 from rigd.excitation.experiment_design import expected_precisions
 from rigd.excitation.targets import parse_target
@@ -211,10 +211,10 @@ def chirp_precision(rig: Rig) -> float:
     loop = RigPreview(load_profile("sim")).plant_with(Plant(beam, damping))
     angle_rad = loop.respond(chirp(rate_hz=RATE_HZ).reference_rad).angle_rad
     slope = tip_motion(Plant(beam, damping), angle_rad, RATE_HZ).slope_rad
-    angle_rad = angle_rad * min(1.0, 0.9 * SMALL_SLOPE_RAD / slope)
+    angle_rad = angle_rad * min(1.0, 0.9 * SMALL_TIP_SLOPE_RAD / slope)
     present = replace(damping, zeta=rig.zeta or _ABSENT, gamma=rig.gamma or _ABSENT)
     noise = 2 * rig.noise_nm**2 / RATE_HZ
-    estimate = BeamEstimate.stated(Plant(beam, present), noise).modal()
+    estimate = BeamEstimate.from_plant(Plant(beam, present), noise).with_modal_parameters()
     precisions = expected_precisions(
         angle_rad, estimate, [parse_target("damping", "100%")], RATE_HZ
     )

@@ -244,10 +244,7 @@ class ReportedMode:
         >>> print(ReportedMode(1, frequency_hz, Estimate(0.00909, None, None)).line())
         mode 1: 2.5699 ± 0.0012 Hz, damping 0.909 %
         """
-        mode_text = (
-            f"mode {self.number}: {self.frequency_hz.text()} Hz, "
-            f"damping {self.damping_ratio.text(100.0)} %"
-        )
+        mode_text = f"mode {self.number}: {self.frequency_hz.text()} Hz, damping {self.damping_ratio.text(100.0)} %"
         if self.participation is None:
             return mode_text
         return f"{mode_text}, inertia {self.participation.text(_KG_MM2_PER_KG_M2)} kg·mm²"
@@ -261,7 +258,7 @@ def modes_from_json(documents: object) -> list[ReportedMode]:
     documents
         Value of the key ``modes`` of a document from any source.
     """
-    return list(_iterate_modes(documents)) if isinstance(documents, list) else []
+    return list(_modes_in_documents(documents)) if isinstance(documents, list) else []
 
 
 def unseen_modes_text(modes: Iterable[ReportedMode]) -> str:
@@ -279,13 +276,15 @@ def unseen_modes_text(modes: Iterable[ReportedMode]) -> str:
     >>> unseen_modes_text(ReportedMode(n, one, one, shown=n == 1) for n in (1, 2, 3))
     'modes 2 and 3'
     """
-    mode_numbers = [str(mode.number) for mode in modes if not mode.shown]
+    unseen_mode_numbers = [str(mode.number) for mode in modes if not mode.shown]
     return (
-        f"mode{'s' if len(mode_numbers) > 1 else ''} {listed(mode_numbers)}" if mode_numbers else ""
+        f"mode{'s' if len(unseen_mode_numbers) > 1 else ''} {listed(unseen_mode_numbers)}"
+        if unseen_mode_numbers
+        else ""
     )
 
 
-def _iterate_modes(documents: list[object]) -> Iterator[ReportedMode]:
+def _modes_in_documents(documents: list[object]) -> Iterator[ReportedMode]:
     """Yield the entries of a JSON list that are modes."""
     for number, document in enumerate(documents[:_MAX_DOCUMENT_MODES], start=1):
         if (mode := ReportedMode.from_json(document, number)) is not None:

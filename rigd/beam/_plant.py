@@ -213,7 +213,7 @@ class Plant:
             **{name: float(document.get(name, 0.0)) for name in _PLANT_PARAMETERS},
         )
 
-    def check(self) -> None:
+    def raise_if_invalid(self) -> None:
         """Raise ValueError if a parameter is not finite or out of its range."""
         for name, value in asdict(self.beam).items():
             if not (value > 0.0 and math.isfinite(value)):

@@ -45,7 +45,7 @@ from rigd.extras import require_extra
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
-    from rigd.excitation import Value
+    from rigd.excitation import OptionValue
     from rigd.runner.session import SessionResult
 
 
@@ -110,7 +110,7 @@ Model = Annotated[
 ]
 
 
-ParametersFunction = Callable[..., "Mapping[str, Value | None]"]
+ParametersFunction = Callable[..., "Mapping[str, OptionValue | None]"]
 """Type of a function that turns the options of an excitation into its parameters.
 
 A parameter has the name of its option if possible."""
@@ -174,7 +174,7 @@ def _added_command(app_name: str, excitation_name: str) -> Any:  # noqa: ANN401 
         return None
     kind, owner = added_excitation
 
-    def parameters(**options: "Value") -> "dict[str, Value]":
+    def parameters(**options: "OptionValue") -> "dict[str, OptionValue]":
         return options
 
     parameters.__name__ = excitation_name
@@ -217,7 +217,7 @@ def _command_option(parameter: inspect.Parameter) -> inspect.Parameter:
 
 def run_sessions(
     excitation_kind: str,
-    parameters: "Mapping[str, Value]",
+    parameters: "Mapping[str, OptionValue]",
     profile: ProfileName = "sim",
     output: Output = SESSIONS_FOLDER,
     repeat: Repeat = 1,
@@ -306,7 +306,7 @@ def chirp(
             "one over frequency.",
         ),
     ] = False,
-) -> "dict[str, Value]":
+) -> "dict[str, OptionValue]":
     """Sweep linearly through a band, by default as in the paper.
 
     Example: rigd run chirp --stop-hz 20 --repeat 5
@@ -317,7 +317,7 @@ def chirp(
 @excitation_command
 def hold(
     duration_s: Duration = 10.0, rest_s: RestS = 1.0, ring_down_s: RingDownS = 0.0
-) -> "dict[str, Value]":
+) -> "dict[str, OptionValue]":
     """Hold the motor at its start angle, to measure noise and drift.
 
     Example: rigd run hold --duration 30
@@ -331,7 +331,7 @@ def step(
     duration_s: Duration = 10.0,
     rest_s: RestS = 1.0,
     ring_down_s: RingDownS = 15.0,
-) -> "dict[str, Value]":
+) -> "dict[str, OptionValue]":
     """Apply a step to the reference.
 
     Example: rigd run step --amplitude 0.01
@@ -352,7 +352,7 @@ def multisine(
     phase_seed: Annotated[
         int, typer.Option("--phase-seed", min=0, help="Seed of the random phases.")
     ] = 0,
-) -> "dict[str, Value]":
+) -> "dict[str, OptionValue]":
     """Excite with a multisine of equal amplitudes and random phases.
 
     The amplitude is the peak of their sum.
@@ -376,7 +376,7 @@ def file(
     ],
     rest_s: RestS = 1.0,
     ring_down_s: RingDownS = 15.0,
-) -> "dict[str, Value]":
+) -> "dict[str, OptionValue]":
     """Follow a reference from a text file.
 
     Columns are separated by commas, semicolons, tabs or blanks, with decimal points or, except
@@ -411,7 +411,7 @@ def modes(
     taper_s: Annotated[
         float, typer.Option("--taper", help="Fade-in and fade-out time of each sweep (s).")
     ] = 1.0,
-) -> "dict[str, Value]":
+) -> "dict[str, OptionValue]":
     """Sweep narrow bands around the modes of an analysis.
 
     The damping parameters are more precise than from a broad sweep of the same length and tip
@@ -445,7 +445,7 @@ def touch(
     path: Model = None,
     rest_s: RestS = 1.0,
     ring_down_s: RingDownS = 1.0,
-) -> "dict[str, Value]":
+) -> "dict[str, OptionValue]":
     """Slew until the beam meets something; brake, hold and withdraw.
 
     The touch is detected by the torque and base shear that the moving beam itself does not explain.
@@ -470,7 +470,7 @@ def move(
     path: Model = None,
     rest_s: RestS = 1.0,
     ring_down_s: RingDownS = 5.0,
-) -> "dict[str, Value]":
+) -> "dict[str, OptionValue]":
     """Move to an angle without leaving a vibration, and stay there.
 
     Example: rigd run move 0.5
@@ -546,7 +546,7 @@ def until(
             "deviation, % of it); 0: exactly uniform (default: the profile's).",
         ),
     ] = None,
-) -> "dict[str, Value | None]":
+) -> "dict[str, OptionValue | None]":
     """Excite the modes until a precision is reached.
 
     A quick scan finds the modes. Each further segment is the most informative one by the record so

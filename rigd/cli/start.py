@@ -35,7 +35,7 @@ from rigd.cli.options import (
 
 if TYPE_CHECKING:
     from rigd.daemon.client import Client
-    from rigd.excitation import Value
+    from rigd.excitation import OptionValue
     from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
 
@@ -95,7 +95,7 @@ def start_processes(
 
 def start_sessions(
     excitation_kind: str,
-    parameters: "Mapping[str, Value]",
+    parameters: "Mapping[str, OptionValue]",
     profile: DaemonProfile = None,
     repeat: Repeat = 1,
     operator: Operator = "",

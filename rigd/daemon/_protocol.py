@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rigd.errors import RigdError
-from rigd.excitation import KINDS, Value, excitation_options
+from rigd.excitation import KINDS, OptionValue, excitation_options
 from rigd.session.user_metadata import NOTES, MetadataError, metadata_keys
 from rigd.units import finite_number
 
@@ -271,7 +271,7 @@ def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
             raise RequestError(f"tip_slope_rad = {tip_slope_rad:g} rad must be more than 0 rad.")
         checked_fields["tip_slope_rad"] = tip_slope_rad
     option_by_name = {option.name: option for option in excitation_options(request.excitation)}
-    checked_values: dict[str, Value] = {}
+    checked_values: dict[str, OptionValue] = {}
     for parameter_name, given_value in given_parameters.items():
         if parameter_name not in option_by_name:
             raise RequestError(
@@ -287,7 +287,9 @@ def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
     return request.model_copy(update={**checked_fields, "parameters": checked_values})
 
 
-def _converted_parameter(parameter_name: str, given_value: object, wanted_type: object) -> Value:
+def _converted_parameter(
+    parameter_name: str, given_value: object, wanted_type: object
+) -> OptionValue:
     """Return a parameter converted to the type `wanted_type`; raise RequestError if impossible."""
     if wanted_type in (float, float | None):
         return _finite_number(parameter_name, given_value)

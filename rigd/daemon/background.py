@@ -17,7 +17,7 @@ from rigd.engine.messages import JobPerformed
 from rigd.engine.processes import ChildError, ChildProcess, SupervisorConnection
 from rigd.engine.workers import PLAN, PREDICTION, Worker
 from rigd.errors import RigdError
-from rigd.excitation import Value
+from rigd.excitation import OptionValue
 from rigd.profile import Profile, with_specimen
 from rigd.runner import Series, with_tip_slope
 from rigd.runner.planning import excitation_for, largest_amplitude, plan_document, predict_session
@@ -53,7 +53,7 @@ class PredictionJob:
     """Profile of the rig."""
     excitation_kind: str
     """Kind of the excitation, such as "chirp"."""
-    parameters: Mapping[str, Value]
+    parameters: Mapping[str, OptionValue]
     """Parameters of the excitation by their names."""
     allows_saturation: bool
     """Whether the torques of motor and sensor may be clipped."""

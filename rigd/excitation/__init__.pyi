@@ -4,7 +4,7 @@ from ._fisher_information import information as information
 from ._from_file import from_csv as from_csv
 from ._move import move as move
 from ._named import KINDS as KINDS
-from ._named import Value as Value
+from ._named import OptionValue as OptionValue
 from ._named import check_excitation_plugin as check_excitation_plugin
 from ._named import excitation_options as excitation_options
 from ._named import find_excitation as find_excitation
@@ -12,7 +12,7 @@ from ._named import make_excitation as make_excitation
 from ._narrow_sweeps import modes as modes
 from ._options import RestS as RestS
 from ._options import RingDownS as RingDownS
-from ._segment_search import SHORTEST_S as SHORTEST_S
+from ._segment_search import SHORTEST_SEGMENT_S as SHORTEST_SEGMENT_S
 from ._segment_search import PrecisionForecast as PrecisionForecast
 from ._segment_search import Segment as Segment
 from ._shortest_move import MovePlant as MovePlant

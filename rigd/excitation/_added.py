@@ -22,7 +22,7 @@ from rigd.units import unit_of
 _SEGMENT_OPTIONS: Final = ("duration_s", "rest_s", "ring_down_s")
 """Options that every excitation of a package has."""
 
-MakeExcitation = Callable[..., Excitation]
+ExcitationFunction = Callable[..., Excitation]
 """Function of the rate and the options that returns an excitation."""
 
 
@@ -33,8 +33,8 @@ def load_excitation(plugin: Plugin) -> ExcitationKind:
     """
     kind = load_declaration(plugin, ExcitationKind)
     with plugin_errors(plugin):
-        options = {option.name for option in fields(kind.options)}
-        missing_options = [name for name in _SEGMENT_OPTIONS if name not in options]
+        option_names = {option.name for option in fields(kind.options)}
+        missing_options = [name for name in _SEGMENT_OPTIONS if name not in option_names]
         if missing_options:
             raise plugin.error(f"its options lack {', '.join(missing_options)}; add them.")
         try:
@@ -45,7 +45,7 @@ def load_excitation(plugin: Plugin) -> ExcitationKind:
 
 
 @lru_cache(maxsize=64)
-def added_function(plugin: Plugin) -> MakeExcitation:
+def plugin_excitation_function(plugin: Plugin) -> ExcitationFunction:
     """Return the function that makes a package's excitation; its arguments are the options."""
     kind = load_excitation(plugin)
 
@@ -64,14 +64,17 @@ def added_function(plugin: Plugin) -> MakeExcitation:
             )
         return assemble_excitation(kind.name, asdict(options), rate_hz, segments, sweep_rad)
 
-    hints = get_type_hints(kind.options, include_extras=True)
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    rate_parameter = inspect.Parameter("rate_hz", keyword, annotation=float)
+    option_types = get_type_hints(kind.options, include_extras=True)
+    keyword_only = inspect.Parameter.KEYWORD_ONLY
+    rate_parameter = inspect.Parameter("rate_hz", keyword_only, annotation=float)
     make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [rate_parameter]
         + [
             inspect.Parameter(
-                option.name, keyword, default=option.default, annotation=hints[option.name]
+                option.name,
+                keyword_only,
+                default=option.default,
+                annotation=option_types[option.name],
             )
             for option in fields(kind.options)
         ]
@@ -87,12 +90,12 @@ def _checked_options(kind: ExcitationKind, given_options: Mapping[str, Any]) -> 
     hints = get_type_hints(kind.options, include_extras=True)
     checked_options = {}
     for option in fields(kind.options):
-        value = given_options.get(option.name, option.default)
+        option_value = given_options.get(option.name, option.default)
         validator = TypeAdapter(hints[option.name], config=ConfigDict(allow_inf_nan=False))
         try:
-            checked_options[option.name] = validator.validate_python(value)
+            checked_options[option.name] = validator.validate_python(option_value)
         except ValidationError as error:
             reason = error.errors()[0]["msg"].replace("Input should be", "must be")
             unit = f" {unit_of(option.name)}".rstrip()
-            raise ExcitationError(f"{option.name} = {value}{unit} {reason}.") from error
+            raise ExcitationError(f"{option.name} = {option_value}{unit} {reason}.") from error
     return kind.options(**checked_options)

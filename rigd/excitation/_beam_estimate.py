@@ -33,15 +33,15 @@ UNIFORM_BEAM_PARAMETERS: Final = (
 )
 """Names of the parameters in the fit of a uniform beam on a rigid clamp."""
 
-PARAMETERS: Final = (*UNIFORM_BEAM_PARAMETERS, *END_PARAMETERS)
+FIT_PARAMETERS: Final = (*UNIFORM_BEAM_PARAMETERS, *END_PARAMETERS)
 """Names of all parameters of the fit; `LOGARITHMIC_PARAMETERS` are fitted as logarithms."""
 
-TOLERATED_DEVIATIONS: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
+DEVIATION_STD_PER_UNIFORMITY: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
 """Map from a constant of a mode that may deviate from that of a uniform beam, to the standard
 deviation of this deviation divided by the uniformity, as in the analyser. The names of free
 parameters append the number of the mode."""
 
-MODAL_CONSTANTS: Final = (*TOLERATED_DEVIATIONS, "ln_damping_ratio", "residue_phase_rad")
+MODAL_CONSTANTS: Final = (*DEVIATION_STD_PER_UNIFORMITY, "ln_damping_ratio", "residue_phase_rad")
 """Names of the free constants of each mode in the modal model."""
 
 _BACKGROUND_TERMS: Final = 5
@@ -55,7 +55,7 @@ class BeamEstimate:
     plant: Plant
     """Estimated beam, damping and torque channel, with the given length. A damping coefficient of 0
     means that the structure has no such damping."""
-    names: tuple[str, ...]
+    free_parameters: tuple[str, ...]
     """Names of the fit's free parameters: some of `PARAMETERS`, and deviations of modes."""
     noise_frequency_hz: RealArray
     """Frequencies of the noise spectrum in increasing order, shape (m,)."""
@@ -83,10 +83,10 @@ class BeamEstimate:
             noise_document = document["noise"]
             estimate = cls(
                 plant=Plant.from_dict(document),
-                names=tuple(
+                free_parameters=tuple(
                     parameter_name
                     for parameter_name in document["names"]
-                    if parameter_name in PARAMETERS
+                    if parameter_name in FIT_PARAMETERS
                 ),
                 noise_frequency_hz=np.array(noise_document["frequency_hz"], dtype=np.float64),
                 noise_nm2_per_hz=np.array(noise_document["nm2_per_hz"], dtype=np.float64),
@@ -95,11 +95,11 @@ class BeamEstimate:
             raise ExcitationError(f"The estimate of the beam has no key {error}.") from None
         except (TypeError, ValueError, AttributeError) as error:
             raise ExcitationError(f"The estimate of the beam cannot be read: {error}.") from None
-        estimate.check()
+        estimate.raise_if_invalid()
         return estimate
 
     @classmethod
-    def stated(cls, plant: Plant, noise_nm2_per_hz: float) -> "BeamEstimate":
+    def from_plant(cls, plant: Plant, noise_nm2_per_hz: float) -> "BeamEstimate":
         """Return an estimate equal to a known plant, with the parameters of a uniform beam free.
 
         Parameters
@@ -125,7 +125,7 @@ class BeamEstimate:
             np.array([noise_nm2_per_hz]),
         )
 
-    def check(self) -> None:
+    def raise_if_invalid(self) -> None:
         """Raise `ExcitationError` if a parameter or the noise spectrum is invalid.
 
         Raises
@@ -134,7 +134,7 @@ class BeamEstimate:
             If a value is not finite or out of range, or no parameter is free.
         """
         try:
-            self.plant.check()
+            self.plant.raise_if_invalid()
         except ValueError as error:
             raise ExcitationError(f"The estimate of the beam has {error}.") from None
         frequency_hz, noise_density = self.noise_frequency_hz, self.noise_nm2_per_hz
@@ -149,7 +149,7 @@ class BeamEstimate:
                 "The estimate of the beam needs noise.frequency_hz, increasing, and as many "
                 "positive noise.nm2_per_hz."
             )
-        if not self.names:
+        if not self.free_parameters:
             raise ExcitationError("The estimate of the beam has no free parameter in names.")
 
     def with_tolerance(self, uniformity: float) -> "BeamEstimate":
@@ -168,7 +168,7 @@ class BeamEstimate:
         order_names = [
             parameter_name
             for parameter_name in ("alpha", "lambda")
-            if parameter_name not in self.names
+            if parameter_name not in self.free_parameters
         ]
         coefficients_by_order = {
             "alpha": self.plant.damping.zeta,
@@ -178,10 +178,10 @@ class BeamEstimate:
         deviation_names = [
             f"{parameter_name}_{mode_number}"
             for mode_number in mode_numbers
-            for parameter_name in TOLERATED_DEVIATIONS
+            for parameter_name in DEVIATION_STD_PER_UNIFORMITY
         ]
-        free_names = (
-            *self.names,
+        free_parameter_names = (
+            *self.free_parameters,
             *(
                 parameter_name
                 for parameter_name in order_names
@@ -189,9 +189,9 @@ class BeamEstimate:
             ),
             *deviation_names,
         )
-        return replace(self, names=free_names, uniformity=uniformity)
+        return replace(self, free_parameters=free_parameter_names, uniformity=uniformity)
 
-    def modal(self) -> "BeamEstimate":
+    def with_modal_parameters(self) -> "BeamEstimate":
         """Return the estimate with the constants of a modal model as its free parameters.
 
         They are the constants of each mode, and those of a background.
@@ -203,12 +203,12 @@ class BeamEstimate:
             for constant_name in MODAL_CONSTANTS
         ]
         background_names = [f"background_{term_power}" for term_power in range(_BACKGROUND_TERMS)]
-        return replace(self, names=(*constant_names, *background_names), uniformity=1.0)
+        return replace(self, free_parameters=(*constant_names, *background_names), uniformity=1.0)
 
     @property
-    def values(self) -> dict[str, float]:
+    def parameter_values(self) -> dict[str, float]:
         """Values of all `PARAMETERS` by name."""
-        return dict.fromkeys(PARAMETERS, 0.0) | self.plant.parameters
+        return dict.fromkeys(FIT_PARAMETERS, 0.0) | self.plant.parameters
 
     def modes(self, highest_hz: float = BAND_HZ) -> tuple[Pole, ...]:
         """Return the beam's poles below a frequency, with derivatives for the free parameters.
@@ -227,15 +227,17 @@ class BeamEstimate:
             if is_above_band[-1]:
                 break
             mode_count *= 2
-        derivative_names = [gradient_name(name) for name in self.names if name in PARAMETERS]
+        derivative_names = [
+            gradient_name(name) for name in self.free_parameters if name in FIT_PARAMETERS
+        ]
         parameter_factors = parameter_scales(self)
         estimated_modes = []
         for pole in self.plant.mode_poles(mode_count, derivative_names):
             if not 0.0 < pole.at_rad_s.imag < 2 * pi * highest_hz:
                 continue
-            mode_gradient = np.zeros(len(self.names), dtype=np.complex128)
+            mode_gradient = np.zeros(len(self.free_parameters), dtype=np.complex128)
             mode_gradient[: len(derivative_names)] = pole.derivative * parameter_factors
-            for parameter_index, parameter_name in enumerate(self.names):
+            for parameter_index, parameter_name in enumerate(self.free_parameters):
                 if parameter_name.endswith(f"_{pole.mode}"):
                     mode_gradient[parameter_index] = POLE_AND_RESIDUE_DERIVATIVES[
                         parameter_name.rpartition("_")[0]
@@ -263,9 +265,11 @@ def parameter_scales(estimate: BeamEstimate) -> RealArray:
     The fit uses the logarithms of zeta and gamma, so their factors are zeta and gamma. The other
     factors are 1.
     """
-    parameter_values = estimate.values
+    parameter_values = estimate.parameter_values
     parameter_names = [
-        parameter_name for parameter_name in estimate.names if parameter_name in PARAMETERS
+        parameter_name
+        for parameter_name in estimate.free_parameters
+        if parameter_name in FIT_PARAMETERS
     ]
     return np.array(
         [

@@ -26,17 +26,17 @@ from numpy.typing import NDArray
 from rigd.beam import CausalTransform, fast_transform_length, gradient_name
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
+    DEVIATION_STD_PER_UNIFORMITY,
+    FIT_PARAMETERS,
     MODAL_CONSTANTS,
-    PARAMETERS,
     POLE_AND_RESIDUE_DERIVATIVES,
-    TOLERATED_DEVIATIONS,
     BeamEstimate,
     ComplexArray,
     RealArray,
     parameter_scales,
 )
 
-_PRIOR_STD: Final = {
+_PRIOR_STD_BY_PARAMETER: Final = {
     "zeta": 3.0,
     "alpha": 1.0,
     "gamma": 3.0,
@@ -48,11 +48,11 @@ _PRIOR_STD: Final = {
 """Prior standard deviation of each parameter without a record: coefficients are known within a
 factor of 20, and orders are in (0, 2)."""
 
-_MIN_SAMPLE_RATE_RATIO: Final = 2.4
+_MIN_SAMPLE_RATE_PER_BAND: Final = 2.4
 """Smallest sampling rate, divided by the upper end of the band."""
-_FADE_END_RATIO: Final = 1.1
+_FADE_END_PER_BAND: Final = 1.1
 """Frequency from which the whitening weight is 0, divided by the upper end of the band."""
-_DECAY_EXPONENT: Final = 5.0
+_TRANSFORM_DECAY_EXPONENT: Final = 5.0
 """Exponent of the damping of the Laplace transform, which is twice as long as the record."""
 
 
@@ -71,15 +71,15 @@ class TorqueModel:
     rate_hz: float
     """Rate of the angle in ticks a second."""
     ticks: int
-    """Length of the records in ticks, a multiple of `sample_ticks`."""
-    sample_ticks: int
+    """Length of the records in ticks, a multiple of `ticks_per_model_sample`."""
+    ticks_per_model_sample: int
     """Number of ticks from one sample of the model to the next."""
     transform: CausalTransform
     """Laplace transform of records, at the rate of the samples."""
-    kernels: ComplexArray
+    derivative_kernels: ComplexArray
     """Whitened derivatives of the response from angle to torque with respect to the free
     parameters, shape (k, K)."""
-    channels: ComplexArray
+    channel_responses: ComplexArray
     """Responses from angle to torque in N·m/rad and to the slope of the tip, shape (2, K)."""
 
     @classmethod
@@ -91,8 +91,8 @@ class TorqueModel:
         transform = CausalTransform(
             2 * sample_count,
             rate_hz / ticks_per_point,
-            _DECAY_EXPONENT,
-            highest_hz=_FADE_END_RATIO * BAND_HZ,
+            _TRANSFORM_DECAY_EXPONENT,
+            highest_hz=_FADE_END_PER_BAND * BAND_HZ,
         )
         return cls(
             estimate,
@@ -107,22 +107,22 @@ class TorqueModel:
     @property
     def sample_hz(self) -> float:
         """Rate of the samples in Hz, at which derivatives of the torque are computed."""
-        return self.rate_hz / self.sample_ticks
+        return self.rate_hz / self.ticks_per_model_sample
 
     def spectrum(self, angle_rad: RealArray) -> ComplexArray:
         """Return the Laplace transform of a motor angle at the frequencies of the band.
 
         The angle in rad begins at rest and has the shape (n,), with n at most `ticks`.
         """
-        return self.transform.forward(angle_rad, oversampling=self.sample_ticks)
+        return self.transform.forward(angle_rad, oversampling=self.ticks_per_model_sample)
 
     def whitened_derivatives(self, angle_transform: ComplexArray) -> RealArray:
         """Return the whitened derivatives of the torque for the k free parameters, at each sample.
 
-        `angle_transform` is the transform of the angle. The shape is (k, ticks / sample_ticks).
+        `angle_transform` is the transform of the angle. The shape is (k, samples).
         """
         return self.transform.inverse(
-            self.kernels * angle_transform, self.ticks // self.sample_ticks
+            self.derivative_kernels * angle_transform, self.ticks // self.ticks_per_model_sample
         )
 
     def torque_and_slope(self, angle_transform: ComplexArray) -> RealArray:
@@ -131,7 +131,9 @@ class TorqueModel:
         `angle_transform` is the transform of the angle.
         """
         return self.transform.inverse(
-            self.channels * angle_transform, self.ticks, oversampling=self.sample_ticks
+            self.channel_responses * angle_transform,
+            self.ticks,
+            oversampling=self.ticks_per_model_sample,
         )
 
 
@@ -156,7 +158,9 @@ def whitened_kernels(estimate: BeamEstimate, s: ComplexArray, sample_hz: float) 
     is (k, K) for K values of the Laplace variable `s` in rad/s.
     """
     parameter_names = [
-        parameter_name for parameter_name in estimate.names if parameter_name in PARAMETERS
+        parameter_name
+        for parameter_name in estimate.free_parameters
+        if parameter_name in FIT_PARAMETERS
     ]
     derivative_names = [
         gradient_name(n) for n in parameter_names if n not in ("delay_s", "tool_inertia_kg_m2")
@@ -166,11 +170,16 @@ def whitened_kernels(estimate: BeamEstimate, s: ComplexArray, sample_hz: float) 
     if parameter_names:
         g, beam_gradient = plant.transfer_and_gradient(s, derivative_names)
     channel_response = plant.channel_response(s)
-    kernels: ComplexArray = np.empty((len(estimate.names), s.size), dtype=np.complex128)
-    kernels[len(parameter_names) :] = _modal_derivatives(estimate, s) * channel_response
+    derivative_kernels: ComplexArray = np.empty(
+        (len(estimate.free_parameters), s.size), dtype=np.complex128
+    )
+    derivative_kernels[len(parameter_names) :] = _modal_derivatives(estimate, s) * channel_response
     gradient_rows = iter(beam_gradient)
     for out, parameter_name, parameter_scale in zip(
-        kernels[: len(parameter_names)], parameter_names, parameter_scales(estimate), strict=True
+        derivative_kernels[: len(parameter_names)],
+        parameter_names,
+        parameter_scales(estimate),
+        strict=True,
     ):
         if parameter_name == "delay_s":
             out[:] = -s * (g + plant.tool_inertia_kg_m2 * s * s) * channel_response
@@ -178,8 +187,8 @@ def whitened_kernels(estimate: BeamEstimate, s: ComplexArray, sample_hz: float) 
             out[:] = s * s * channel_response
         else:
             out[:] = parameter_scale * next(gradient_rows) * channel_response
-    kernels *= _whitening_weights(estimate, s.imag / (2 * pi), sample_hz)
-    return kernels
+    derivative_kernels *= _whitening_weights(estimate, s.imag / (2 * pi), sample_hz)
+    return derivative_kernels
 
 
 def _modal_derivatives(estimate: BeamEstimate, s: ComplexArray) -> ComplexArray:
@@ -189,8 +198,8 @@ def _modal_derivatives(estimate: BeamEstimate, s: ComplexArray) -> ComplexArray:
     """
     poles_by_mode = {beam_mode.mode: beam_mode.at_rad_s for beam_mode in estimate.modes()}
     derivative_rows = []
-    for parameter_name in estimate.names:
-        if parameter_name in PARAMETERS:
+    for parameter_name in estimate.free_parameters:
+        if parameter_name in FIT_PARAMETERS:
             continue
         constant_kind, _, mode_number = parameter_name.rpartition("_")
         if constant_kind == "background":
@@ -212,7 +221,7 @@ def _modal_derivatives(estimate: BeamEstimate, s: ComplexArray) -> ComplexArray:
 
 def ticks_per_sample(rate_hz: float) -> int:
     """Return the number of ticks per sample, so small that the samples contain the band."""
-    return max(int(rate_hz / (_MIN_SAMPLE_RATE_RATIO * BAND_HZ)), 1)
+    return max(int(rate_hz / (_MIN_SAMPLE_RATE_PER_BAND * BAND_HZ)), 1)
 
 
 def _whitening_weights(
@@ -225,7 +234,7 @@ def _whitening_weights(
     log_noise_density = np.interp(
         frequency_hz, estimate.noise_frequency_hz, np.log(estimate.noise_nm2_per_hz)
     )
-    fade_factors = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADE_END_RATIO - 1.0), 0.0, 1.0)
+    fade_factors = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADE_END_PER_BAND - 1.0), 0.0, 1.0)
     whitening_weights: RealArray = np.exp(-0.5 * log_noise_density) * np.sqrt(2.0 / sample_hz)
     whitening_weights *= 0.5 + 0.5 * np.cos(pi * fade_factors)
     return whitening_weights
@@ -240,10 +249,10 @@ class RecordSoFar:
 
     estimate: BeamEstimate
     """Estimate of the beam from which the information is computed."""
-    past_gram: RealArray
+    past_gram_matrix: RealArray
     """Gram matrix of the record's k torque derivatives and m nuisance terms, shape
     (k + m, k + m)."""
-    future_rows: RealArray
+    future_derivatives: RealArray
     """Derivatives and nuisance terms from now on if the motor is held, shape (k + m, samples)."""
     ringing_motion: RealArray
     """Torque in N·m and slope of the tip in rad from now on if the motor is held, shape
@@ -292,21 +301,30 @@ class RecordSoFar:
     @property
     def nuisance_projection(self) -> RealArray:
         """Matrix that projects the nuisance terms out of the derivatives, shape (k, k + m)."""
-        k = len(self.estimate.names)
-        return np.concatenate([np.eye(k), -_regression_coefficients(self.past_gram, k)], axis=1)
+        parameter_count = len(self.estimate.free_parameters)
+        return np.concatenate(
+            [
+                np.eye(parameter_count),
+                -_regression_coefficients(self.past_gram_matrix, parameter_count),
+            ],
+            axis=1,
+        )
 
-    def information_after(self, added_rows: RealArray | None, sample_count: int) -> RealArray:
+    def information_after(
+        self, added_derivatives: RealArray | None, sample_count: int
+    ) -> RealArray:
         """Return the Fisher information on the parameters after further samples, shape (k, k).
 
-        `added_rows` are the derivatives that a segment adds from now on, shape (k, n) with n at
-        least `sample_count`; without them the motor is held.
+        `added_derivatives` are the derivatives that a segment adds from now on, shape (k, n) with n
+        at least `sample_count`; without them the motor is held.
         """
-        whitened_rows = self.future_rows[:, :sample_count]
-        if added_rows is not None:
+        whitened_rows = self.future_derivatives[:, :sample_count]
+        if added_derivatives is not None:
             whitened_rows = whitened_rows.copy()
-            whitened_rows[: added_rows.shape[0]] += added_rows[:, :sample_count]
+            whitened_rows[: added_derivatives.shape[0]] += added_derivatives[:, :sample_count]
         return projected_information(
-            self.past_gram + whitened_rows @ whitened_rows.T, len(self.estimate.names)
+            self.past_gram_matrix + whitened_rows @ whitened_rows.T,
+            len(self.estimate.free_parameters),
         )
 
 
@@ -314,9 +332,9 @@ def information(angle_rad: RealArray, estimate: BeamEstimate, rate_hz: float) ->
     """Return a record's Fisher information on the free parameters of the beam, shape (k, k).
 
     Free decay from before the record, and offset and drift of the torque, are unknown as well and
-    reduce the information. The parameters are in the order of ``estimate.names``. For zeta, gamma,
-    density over stiffness and stiffness, logarithms are used. The inverse of the information is
-    the smallest covariance that an unbiased estimate can have.
+    reduce the information. The parameters are in the order of ``estimate.free_parameters``. For
+    zeta, gamma, density over stiffness and stiffness, logarithms are used. The inverse of the
+    information is the smallest covariance that an unbiased estimate can have.
 
     Parameters
     ----------
@@ -335,7 +353,7 @@ def information(angle_rad: RealArray, estimate: BeamEstimate, rate_hz: float) ->
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> estimate = BeamEstimate(
     ...     plant=Plant(beam, Damping(zeta=7e-5, gamma=0.02)),
-    ...     names=("zeta", "gamma", "density_over_stiffness"),
+    ...     free_parameters=("zeta", "gamma", "density_over_stiffness"),
     ...     noise_frequency_hz=np.array([1.0]),
     ...     noise_nm2_per_hz=np.array([2e-7]),
     ... )
@@ -347,26 +365,33 @@ def information(angle_rad: RealArray, estimate: BeamEstimate, rate_hz: float) ->
     return RecordSoFar.from_angle(angle_rad, estimate, rate_hz).information_after(None, 0)
 
 
-def projected_information(gram: RealArray, k: int) -> RealArray:
+def projected_information(gram_matrix: RealArray, parameter_count: int) -> RealArray:
     """Return the Fisher information on the first k parameters if all others are unknown.
 
-    `gram` is the Gram matrix of the derivatives for all parameters, shape (k + m, k + m).
+    `gram_matrix` is the Gram matrix of the derivatives for all parameters, shape (k + m, k + m).
     """
-    information: RealArray = gram[:k, :k] - _regression_coefficients(gram, k) @ gram[k:, :k]
+    information: RealArray = (
+        gram_matrix[:parameter_count, :parameter_count]
+        - _regression_coefficients(gram_matrix, parameter_count)
+        @ gram_matrix[parameter_count:, :parameter_count]
+    )
     return 0.5 * (information + information.T)
 
 
-def _regression_coefficients(gram: RealArray, k: int) -> RealArray:
+def _regression_coefficients(gram_matrix: RealArray, parameter_count: int) -> RealArray:
     """Return the coefficients of the regression of the first k derivatives on the m others.
 
-    The shape is (k, m), and `gram` is the Gram matrix of all derivatives.
+    The shape is (k, m), and `gram_matrix` is the Gram matrix of all derivatives.
     """
-    derivative_norms = np.sqrt(np.maximum(np.diag(gram)[k:], 1e-300))
-    normalized_gram = gram[k:, k:] / np.outer(derivative_norms, derivative_norms) + 1e-12 * np.eye(
-        derivative_norms.size
-    )
+    derivative_norms = np.sqrt(np.maximum(np.diag(gram_matrix)[parameter_count:], 1e-300))
+    normalized_gram = gram_matrix[parameter_count:, parameter_count:] / np.outer(
+        derivative_norms, derivative_norms
+    ) + 1e-12 * np.eye(derivative_norms.size)
     coefficients: RealArray = (
-        np.linalg.solve(normalized_gram, gram[k:, :k] / derivative_norms[:, None]).T
+        np.linalg.solve(
+            normalized_gram,
+            gram_matrix[parameter_count:, :parameter_count] / derivative_norms[:, None],
+        ).T
         / derivative_norms
     )
     return coefficients
@@ -375,34 +400,36 @@ def _regression_coefficients(gram: RealArray, k: int) -> RealArray:
 def covariance_of(fisher_information: RealArray, estimate: BeamEstimate) -> RealArray:
     """Return the parameters' covariance from a Fisher information and prior knowledge."""
     prior_stds = np.array(
-        [_prior_std(parameter_name, estimate) for parameter_name in estimate.names]
+        [_prior_std(parameter_name, estimate) for parameter_name in estimate.free_parameters]
     )
     # In units of the prior the matrix is well scaled wherever something is known.
     scaled_information = fisher_information * np.outer(prior_stds, prior_stds) + np.eye(
         len(prior_stds)
     )
-    diagonal_roots = np.sqrt(np.diag(scaled_information))
+    diagonal_square_roots = np.sqrt(np.diag(scaled_information))
     inverse_matrix: RealArray = np.linalg.inv(
-        scaled_information / np.outer(diagonal_roots, diagonal_roots)
+        scaled_information / np.outer(diagonal_square_roots, diagonal_square_roots)
     )
-    return inverse_matrix * np.outer(prior_stds / diagonal_roots, prior_stds / diagonal_roots)
+    return inverse_matrix * np.outer(
+        prior_stds / diagonal_square_roots, prior_stds / diagonal_square_roots
+    )
 
 
-def _prior_std(name: str, estimate: BeamEstimate) -> float:
+def _prior_std(parameter_name: str, estimate: BeamEstimate) -> float:
     """Return the standard deviation that a parameter is assumed to have before any record."""
     beam = estimate.plant.beam
-    constant_kind = name.rpartition("_")[0]
+    constant_kind = parameter_name.rpartition("_")[0]
     if constant_kind == "background":
         return 10.0 * beam.bending_stiffness_n_m2 / beam.length_m
     if constant_kind in MODAL_CONSTANTS:
-        return TOLERATED_DEVIATIONS.get(constant_kind, 1.0) * estimate.uniformity
-    if name == "tool_inertia_kg_m2":
+        return DEVIATION_STD_PER_UNIFORMITY.get(constant_kind, 1.0) * estimate.uniformity
+    if parameter_name == "tool_inertia_kg_m2":
         return beam.inertia_kg_m2
-    if name == "tip_mass_kg":
+    if parameter_name == "tip_mass_kg":
         return beam.density_kg_per_m * beam.length_m
-    if name == "root_compliance_rad_per_nm":
+    if parameter_name == "root_compliance_rad_per_nm":
         return beam.length_m / beam.bending_stiffness_n_m2
-    return _PRIOR_STD[name]
+    return _PRIOR_STD_BY_PARAMETER[parameter_name]
 
 
 def _nuisance_terms(estimate: BeamEstimate, sample_count: int, sample_hz: float) -> RealArray:

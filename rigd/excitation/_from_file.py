@@ -115,18 +115,18 @@ def _read_columns(
         )
     for column_name, column_values in ((ANGLE_COLUMN, angle_column), (TIME_COLUMN, time_column)):
         if column_values is not None and not np.isfinite(column_values.values).all():
-            row = int(np.argmin(np.isfinite(column_values.values)))
+            row_index = int(np.argmin(np.isfinite(column_values.values)))
             raise ExcitationError(
-                f"{path}: line {text_table.line_numbers[row]}: {column_name} is not a finite "
+                f"{path}: line {text_table.line_numbers[row_index]}: {column_name} is not a finite "
                 "number."
             )
     if (
         time_column is not None
         and (is_not_increasing := time_column.values[1:] <= time_column.values[:-1]).any()
     ):
-        row = int(np.argmax(is_not_increasing)) + 1
+        row_index = int(np.argmax(is_not_increasing)) + 1
         raise ExcitationError(
-            f"{path}: line {text_table.line_numbers[row]}: {TIME_COLUMN} does not come after the "
+            f"{path}: line {text_table.line_numbers[row_index]}: {TIME_COLUMN} does not come after the "
             "one before it; times must increase."
         )
     return (None if time_column is None else time_column.values), angle_column.values

@@ -88,13 +88,13 @@ def move(
     target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
     require_within_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
     rig_plant = rig.move_plant(path, MOVE)
-    farthest_rad = _MAX_END_ANGLE_FRACTION * rig_plant.angle_rad
-    if not abs(target_rad) <= farthest_rad:
+    farthest_allowed_rad = _MAX_END_ANGLE_FRACTION * rig_plant.angle_rad
+    if not abs(target_rad) <= farthest_allowed_rad:
         raise ExcitationError(
             f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
-            f"{rig_plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either "
-            "side; choose at most "
-            f"that{'' if by_rad is None else _allowed_range(farthest_rad, start_rad)}."
+            f"{rig_plant.angle_rad:g} rad allows {farthest_allowed_rad:.4g} rad from the zero to "
+            "either side; choose at most "
+            f"that{'' if by_rad is None else _allowed_range(farthest_allowed_rad, start_rad)}."
         )
     distance_rad = target_rad - start_rad
     if abs(distance_rad) < _MIN_DISTANCE_RAD:
@@ -133,9 +133,9 @@ def move(
     )
 
 
-def _allowed_range(farthest_rad: float, start_rad: float) -> str:
+def _allowed_range(farthest_allowed_rad: float, start_rad: float) -> str:
     """Return the end of a message that states the range of distances which a move may have."""
-    lowest_rad, highest_rad = -farthest_rad - start_rad, farthest_rad - start_rad
+    lowest_rad, highest_rad = -farthest_allowed_rad - start_rad, farthest_allowed_rad - start_rad
     return f", that is by {lowest_rad:.4g} to {highest_rad:.4g} rad from {start_rad:.4g} rad"
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, Protocol
 
-from rigd.excitation._added import MakeExcitation, added_function, load_excitation
+from rigd.excitation._added import ExcitationFunction, load_excitation, plugin_excitation_function
 from rigd.excitation._from_file import from_csv
 from rigd.excitation._move import MoveRig, move
 from rigd.excitation._narrow_sweeps import SweepRig, modes
@@ -16,7 +16,7 @@ from rigd.excitation._until import ScanRig, until
 from rigd.excitation.declaration import ExcitationKind
 from rigd.plugins import Plugin, Registry
 
-Value = float | int | str | Path
+OptionValue = float | int | str | Path
 """Type of an option's value in a request for an excitation."""
 
 
@@ -24,7 +24,7 @@ class ExcitationRig(SweepRig, MoveRig, ScanRig, Protocol):
     """Interface to a rig for which any kind of excitation is planned: limits and predictions."""
 
 
-KINDS: Final[Registry[MakeExcitation]] = Registry(
+KINDS: Final[Registry[ExcitationFunction]] = Registry(
     "rigd.excitations",
     {
         "chirp": chirp,
@@ -37,7 +37,7 @@ KINDS: Final[Registry[MakeExcitation]] = Registry(
         "touch": touch,
         "until": until,
     },
-    added_function,
+    plugin_excitation_function,
 )
 """Functions that return an excitation, by its name on the command line and in session files.
 
@@ -63,7 +63,10 @@ def excitation_options(name: str) -> tuple[ExcitationOption, ...]:
 
 
 def make_excitation(
-    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: ExcitationRig | None = None
+    kind: str,
+    parameters: Mapping[str, OptionValue],
+    rate_hz: float,
+    rig: ExcitationRig | None = None,
 ) -> Excitation:
     """Return the excitation of a given kind, such as ``"chirp"``, at a rig's rate.
 
@@ -90,10 +93,10 @@ def make_excitation(
     >>> make_excitation("step", {"amplitude_rad": 0.01}, rate_hz=1000).parameters["amplitude_rad"]
     0.01
     """
-    make_kind = KINDS[kind]
-    if "rig" in inspect.signature(make_kind).parameters:
-        return make_kind(rate_hz=rate_hz, rig=rig, **parameters)
-    return make_kind(rate_hz=rate_hz, **parameters)
+    excitation_function = KINDS[kind]
+    if "rig" in inspect.signature(excitation_function).parameters:
+        return excitation_function(rate_hz=rate_hz, rig=rig, **parameters)
+    return excitation_function(rate_hz=rate_hz, **parameters)
 
 
 def find_excitation(name: str) -> tuple[ExcitationKind, Plugin] | None:
@@ -109,8 +112,8 @@ def find_excitation(name: str) -> tuple[ExcitationKind, Plugin] | None:
     PluginError
         If the package cannot be used.
     """
-    owner = KINDS.owner(name)
-    return None if owner is None else (load_excitation(owner), owner)
+    owner_plugin = KINDS.owner(name)
+    return None if owner_plugin is None else (load_excitation(owner_plugin), owner_plugin)
 
 
 def check_excitation_plugin(plugin: Plugin) -> str:

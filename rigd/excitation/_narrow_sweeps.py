@@ -29,11 +29,11 @@ from rigd.beam import (
     transfer_and_gradient,
     undamped_frequencies_rad_s,
 )
-from rigd.beam.tip import SMALL_SLOPE_RAD
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD
 from rigd.documents import DocumentError, read_json
 from rigd.excitation._options import RestS, RingDownS, documented
 from rigd.excitation._signals import (
-    LIMIT_FRACTION,
+    MAX_PLANNED_LIMIT_FRACTION,
     Excitation,
     ExcitationError,
     assemble_excitation,
@@ -46,12 +46,12 @@ from rigd.excitation._signals import (
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_MAX_REDUCTIONS: Final = 8
+_MAX_AMPLITUDE_REDUCTIONS: Final = 8
 """Largest number of times that the amplitude of a sweep is reduced to stay within the limits."""
-_LIMIT_TOLERANCE: Final = 1.005
+_LIMIT_FRACTION_TOLERANCE: Final = 1.005
 """Factor by which a sweep may still exceed its fraction of the limits after the last reduction."""
 
-LEAST_TIME_FRACTION: Final = 0.5
+MIN_BAND_TIME_FRACTION: Final = 0.5
 """Shortest time of a band, relative to its time in an equal division: no mode is left out."""
 
 SAME_MODE_FREQUENCY_RATIO: Final = 1.1
@@ -121,7 +121,7 @@ class _Headline(BaseModel):
     modes: Annotated[list[_HeadlineMode], FailFast()] = []
 
 
-class _Document(BaseModel):
+class _AnalysisDocument(BaseModel):
     """JSON document of an analysis, reduced to the keys from which modes are read."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -154,7 +154,7 @@ def read_modes(document_path: str | Path) -> tuple[FoundMode, ...]:
     """
     document_path = Path(document_path)
     try:
-        analysis_document = _Document.model_validate(_read_json(document_path))
+        analysis_document = _AnalysisDocument.model_validate(_read_json(document_path))
     except ValidationError as error:
         complaint_text = _describe_invalid_value(
             error.errors(include_url=False, include_context=False)[0]
@@ -237,16 +237,16 @@ def _mode_groups(mode_entries: Sequence[_ModeEntry]) -> Iterator[list[_ModeEntry
 
 def _median_mode(mode_entries: Sequence[_ModeEntry]) -> FoundMode:
     """Return the median of several fits' entries for one mode."""
-    middle_hz = median(_frequency_hz(mode_entry) for mode_entry in mode_entries)
-    stated_hz = median(mode_entry.frequency_std_hz or 0.0 for mode_entry in mode_entries)
+    median_hz = median(_frequency_hz(mode_entry) for mode_entry in mode_entries)
+    stated_std_hz = median(mode_entry.frequency_std_hz or 0.0 for mode_entry in mode_entries)
     # Fits of unsuitable structures lie far off: the median of the distances tolerates them.
     scatter_hz = 1.4826 * median(
-        abs(_frequency_hz(mode_entry) - middle_hz) for mode_entry in mode_entries
+        abs(_frequency_hz(mode_entry) - median_hz) for mode_entry in mode_entries
     )
     return FoundMode(
-        frequency_hz=middle_hz,
+        frequency_hz=median_hz,
         damping_ratio=median(mode_entry.damping_ratio or 0.0 for mode_entry in mode_entries),
-        uncertainty_hz=2.0 * max(stated_hz, scatter_hz),
+        uncertainty_hz=2.0 * max(stated_std_hz, scatter_hz),
     )
 
 
@@ -257,12 +257,12 @@ def _frequency_hz(mode_entry: _ModeEntry) -> float:
 
 # Bands, and the time spent in each
 
-_BAND_POINTS: Final = 64
+_FREQUENCIES_PER_BAND: Final = 64
 """Number of frequencies in a band at which the information is computed."""
 
-_TIME_STEPS: Final = 500
+_TIME_DIVISION_STEPS: Final = 500
 """Number of multiplicative steps in the search for the best division of the time."""
-_REGULARISATION: Final = 1e-12
+_INFORMATION_REGULARISATION: Final = 1e-12
 """Relative regularisation of the information matrix, since few bands leave some combinations of
 parameters undetermined."""
 
@@ -296,20 +296,20 @@ class Band:
     """Upper end of the band in Hz."""
 
     @classmethod
-    def around_mode(cls, found_mode: FoundMode, widths: float) -> "Band":
+    def around_mode(cls, found_mode: FoundMode, half_power_widths: float) -> "Band":
         """Return the band of frequencies to be swept around a mode.
 
-        On either side it extends by the uncertainty of the frequency and by `widths` half-power
+        On either side it extends by the uncertainty of the frequency and by a number of half-power
         widths.
         """
-        half_hz = (
-            widths * 2.0 * found_mode.damping_ratio * found_mode.frequency_hz
+        half_width_hz = (
+            half_power_widths * 2.0 * found_mode.damping_ratio * found_mode.frequency_hz
             + found_mode.uncertainty_hz
         )
         # A sweep needs a period: strongly damped modes would begin at 0 Hz or below.
         return cls(
-            found_mode, max(found_mode.frequency_hz - half_hz, 0.2 * found_mode.frequency_hz),
-            found_mode.frequency_hz + half_hz,
+            found_mode, max(found_mode.frequency_hz - half_width_hz, 0.2 * found_mode.frequency_hz),
+            found_mode.frequency_hz + half_width_hz,
         )  # fmt: skip
 
     @property
@@ -333,18 +333,20 @@ def time_fractions(
     )
     parameter_scales = np.sqrt(np.einsum("bii->i", information_rates))
     information_rates = information_rates / np.outer(parameter_scales, parameter_scales)
-    fractions = np.full(len(sweep_bands), 1.0 / len(sweep_bands))
-    for _ in range(_TIME_STEPS):
-        information = np.tensordot(fractions, information_rates, axes=1)
-        covariance = np.linalg.inv(information + _REGULARISATION * np.eye(len(parameter_scales)))
+    band_time_fractions = np.full(len(sweep_bands), 1.0 / len(sweep_bands))
+    for _ in range(_TIME_DIVISION_STEPS):
+        information = np.tensordot(band_time_fractions, information_rates, axes=1)
+        covariance = np.linalg.inv(
+            information + _INFORMATION_REGULARISATION * np.eye(len(parameter_scales))
+        )
         gain_directions = covariance[:damping_count]
         precision_gains = (
             np.einsum("pi,bij,pj->bp", gain_directions, information_rates, gain_directions)
             / np.diag(covariance)[:damping_count]
         )
-        fractions = fractions * np.sqrt(precision_gains.sum(axis=1))
-        fractions /= fractions.sum()
-    return fractions
+        band_time_fractions = band_time_fractions * np.sqrt(precision_gains.sum(axis=1))
+        band_time_fractions /= band_time_fractions.sum()
+    return band_time_fractions
 
 
 def first_order_damping(modes: Sequence[FoundMode], beam: Beam) -> Damping:
@@ -385,7 +387,7 @@ def _information_rates(
     ]
     information_rates = []
     for sweep_band, amplitude_rad in zip(sweep_bands, amplitudes_rad, strict=True):
-        frequency_hz = np.linspace(sweep_band.start_hz, sweep_band.stop_hz, _BAND_POINTS)
+        frequency_hz = np.linspace(sweep_band.start_hz, sweep_band.stop_hz, _FREQUENCIES_PER_BAND)
         s = 2j * pi * frequency_hz
         band_beam = _beam_with_mode(rig.beam, sweep_band.mode.frequency_hz)
         g, gradient = transfer_and_gradient(
@@ -396,7 +398,9 @@ def _information_rates(
         )[:, None]
         whitened_rows = np.concatenate([gradient, [-s * g, s * s]])
         whitened_rows *= amplitude_rad * rig.tracking(frequency_hz)
-        information_rates.append((whitened_rows.conj() @ whitened_rows.T).real / _BAND_POINTS)
+        information_rates.append(
+            (whitened_rows.conj() @ whitened_rows.T).real / _FREQUENCIES_PER_BAND
+        )
     return np.array(information_rates), len(parameter_names)
 
 
@@ -405,12 +409,14 @@ def _beam_with_mode(beam: Beam, frequency_hz: float) -> Beam:
 
     It is needed because the profile's frequencies may be wrong by more than the width of a band.
     """
-    mode_rad_s = 2.0 * pi * frequency_hz
-    modes_rad_s = undamped_frequencies_rad_s(beam, 12)
-    nearest_rad_s = modes_rad_s[np.argmin(np.abs(np.log(modes_rad_s / mode_rad_s)))]
+    target_mode_rad_s = 2.0 * pi * frequency_hz
+    beam_mode_frequencies_rad_s = undamped_frequencies_rad_s(beam, 12)
+    nearest_mode_rad_s = beam_mode_frequencies_rad_s[
+        np.argmin(np.abs(np.log(beam_mode_frequencies_rad_s / target_mode_rad_s)))
+    ]
     return Beam(
         length_m=beam.length_m,
-        density_kg_per_m=beam.density_kg_per_m * float(nearest_rad_s / mode_rad_s) ** 2,
+        density_kg_per_m=beam.density_kg_per_m * float(nearest_mode_rad_s / target_mode_rad_s) ** 2,
         bending_stiffness_n_m2=beam.bending_stiffness_n_m2,
     )
 
@@ -454,7 +460,7 @@ def modes(
     tip_slope_rad: Annotated[
         float,
         doc("Largest slope of the beam's free end, of which the sweeps use 90 %."),
-    ] = SMALL_SLOPE_RAD,
+    ] = SMALL_TIP_SLOPE_RAD,
     rig: Annotated[
         SweepRig | None,
         doc(
@@ -482,33 +488,38 @@ def modes(
     fade_ticks = 2 * round(taper_s * rate_hz)
     if (
         fade_ticks < 2
-        or LEAST_TIME_FRACTION * (sweep_end - sweep_begin) / len(sweep_bands) < fade_ticks
+        or MIN_BAND_TIME_FRACTION * (sweep_end - sweep_begin) / len(sweep_bands) < fade_ticks
     ):
         raise ExcitationError(
             f"duration_s = {duration_s:g} s is too short for fades of taper_s = {taper_s:g} s at "
             f"both ends of {len(sweep_bands)} sweeps; choose at least "
-            f"{2.0 * taper_s * len(sweep_bands) / LEAST_TIME_FRACTION:g} s, or a taper_s from "
+            f"{2.0 * taper_s * len(sweep_bands) / MIN_BAND_TIME_FRACTION:g} s, or a taper_s from "
             f"{2 / rate_hz:g} s."
         )
     sweep_ticks = _divide_ticks(
         np.full(len(sweep_bands), 1.0 / len(sweep_bands)), sweep_end - sweep_begin
     )
     amplitudes_rad = [amplitude_rad] * len(sweep_bands)
-    sweeps = [
+    unit_sweeps = [
         _unit_sweep(*band_and_ticks, fade_ticks, rate_hz)
         for band_and_ticks in zip(sweep_bands, sweep_ticks, strict=True)
     ]
     if rig is not None:
-        reduced_rad = _admissible_amplitudes(sweeps, amplitude_rad, tip_slope_rad, rig)
-        sweep_ticks = _divide_ticks(
-            _raise_to_least(time_fractions(sweep_bands, reduced_rad, rig)), sweep_end - sweep_begin
+        reduced_amplitudes_rad = _admissible_amplitudes(
+            unit_sweeps, amplitude_rad, tip_slope_rad, rig
         )
-        sweeps = [
+        sweep_ticks = _divide_ticks(
+            _raise_to_min_fraction(time_fractions(sweep_bands, reduced_amplitudes_rad, rig)),
+            sweep_end - sweep_begin,
+        )
+        unit_sweeps = [
             _unit_sweep(*band_and_ticks, fade_ticks, rate_hz)
             for band_and_ticks in zip(sweep_bands, sweep_ticks, strict=True)
         ]
-        amplitudes_rad = _admissible_amplitudes(sweeps, amplitude_rad, tip_slope_rad, rig)
-    reference_rad = np.concatenate([a * s for a, s in zip(amplitudes_rad, sweeps, strict=True)])
+        amplitudes_rad = _admissible_amplitudes(unit_sweeps, amplitude_rad, tip_slope_rad, rig)
+    reference_rad = np.concatenate(
+        [a * s for a, s in zip(amplitudes_rad, unit_sweeps, strict=True)]
+    )
     parameters: dict[str, float | int | str] = {
         "file": Path(path).name,
         "amplitude_rad": max(amplitudes_rad),
@@ -562,18 +573,18 @@ def _admissible_amplitudes(
     amplitudes_rad = []
     earlier_sweeps_rad = np.empty(0)
     for sweep in unit_sweeps:
-        reduced_rad = amplitude_rad
-        for _ in range(_MAX_REDUCTIONS):
-            sweeps_so_far_rad = np.concatenate([earlier_sweeps_rad, reduced_rad * sweep])
+        reduced_amplitude_rad = amplitude_rad
+        for _ in range(_MAX_AMPLITUDE_REDUCTIONS):
+            sweeps_so_far_rad = np.concatenate([earlier_sweeps_rad, reduced_amplitude_rad * sweep])
             limit_fraction = max(
                 rig.fraction_of_limits(sweeps_so_far_rad),
                 rig.tip_slope_rad(sweeps_so_far_rad) / tip_slope_rad,
             )
-            if limit_fraction <= LIMIT_FRACTION * _LIMIT_TOLERANCE:
+            if limit_fraction <= MAX_PLANNED_LIMIT_FRACTION * _LIMIT_FRACTION_TOLERANCE:
                 break
-            reduced_rad *= LIMIT_FRACTION / limit_fraction
-        amplitudes_rad.append(reduced_rad)
-        earlier_sweeps_rad = np.concatenate([earlier_sweeps_rad, reduced_rad * sweep])
+            reduced_amplitude_rad *= MAX_PLANNED_LIMIT_FRACTION / limit_fraction
+        amplitudes_rad.append(reduced_amplitude_rad)
+        earlier_sweeps_rad = np.concatenate([earlier_sweeps_rad, reduced_amplitude_rad * sweep])
     return amplitudes_rad
 
 
@@ -583,19 +594,19 @@ def _divide_ticks(band_fractions: RealArray, tick_count: int) -> list[int]:
     return [int(part_ticks) for part_ticks in np.diff(end_ticks, prepend=0)]
 
 
-def _raise_to_least(band_fractions: RealArray) -> RealArray:
+def _raise_to_min_fraction(band_fractions: RealArray) -> RealArray:
     """Return the bands' fractions of the time, each raised to the least that is allowed.
 
     The other fractions are reduced in proportion, so that the sum remains 1.
     """
-    least_fraction = LEAST_TIME_FRACTION / len(band_fractions)
-    is_low = band_fractions < least_fraction
+    min_fraction = MIN_BAND_TIME_FRACTION / len(band_fractions)
+    is_low = band_fractions < min_fraction
     for _ in band_fractions:
-        remaining_scale = (1.0 - least_fraction * np.count_nonzero(is_low)) / band_fractions[
+        remaining_scale = (1.0 - min_fraction * np.count_nonzero(is_low)) / band_fractions[
             ~is_low
         ].sum()
-        raised_fractions = np.where(is_low, least_fraction, band_fractions * remaining_scale)
-        is_low = raised_fractions <= least_fraction
+        raised_fractions = np.where(is_low, min_fraction, band_fractions * remaining_scale)
+        is_low = raised_fractions <= min_fraction
     return raised_fractions
 
 

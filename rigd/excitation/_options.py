@@ -48,16 +48,16 @@ class ExcitationOption:
 
 
 def declared_options(
-    function: Callable[..., Any], *, with_rig: bool = False
+    function: Callable[..., Any], *, include_rig_arguments: bool = False
 ) -> tuple[ExcitationOption, ...]:
     """Return the options of a function that returns an excitation.
 
-    Arguments that are data of the rig (`RIG_ARGUMENTS`) are included only `with_rig`.
+    Arguments that are data of the rig (`RIG_ARGUMENTS`) are left out by default.
     """
     return tuple(
         _option(argument)
         for argument in inspect.signature(function).parameters.values()
-        if with_rig or argument.name not in RIG_ARGUMENTS
+        if include_rig_arguments or argument.name not in RIG_ARGUMENTS
     )
 
 
@@ -82,10 +82,10 @@ def documented(function: F) -> F:
     summary, separator, raises_text = inspect.cleandoc(function.__doc__ or "").partition(
         "\nRaises\n---"
     )
-    entries = "".join(
+    parameter_entries = "".join(
         f"{option.name}\n    {option.help}\n"
-        for option in declared_options(function, with_rig=True)
+        for option in declared_options(function, include_rig_arguments=True)
     )
-    section = f"\nParameters\n----------\n{entries}"
-    function.__doc__ = f"{summary.rstrip()}\n{section}{separator}{raises_text}"
+    docstring_section = f"\nParameters\n----------\n{parameter_entries}"
+    function.__doc__ = f"{summary.rstrip()}\n{docstring_section}{separator}{raises_text}"
     return function

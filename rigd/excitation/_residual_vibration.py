@@ -19,7 +19,7 @@ _MIN_SIMULATED_S: Final = 1.0
 """Shortest time in s after the reference for which the motion is simulated."""
 _MIN_RING_DOWN_S: Final = 1.0
 """Duration in s that a shorter ring-down is replaced with to compute the sensor's noise floor."""
-_SQUARED_AMPLITUDE_1_IN_1000: Final = 13.8
+_SQUARED_AMPLITUDE_QUANTILE_999: Final = 13.8
 """Square of the amplitude a that noise exceeds once in 1000 times, over the variance of its cosine
 or sine component: exp(-a²/2) = 0.001."""
 
@@ -32,7 +32,7 @@ class DisturbedRig(Protocol):
         """Ticks a second."""
 
     @property
-    def disturbed(self) -> Callable[[RealArray, int], tuple[RealArray, RealArray]]:
+    def respond_disturbed(self) -> Callable[[RealArray, int], tuple[RealArray, RealArray]]:
         """Function that simulates the rig, of a reference, shape (n,), and a number of modes.
 
         It returns the angle in rad, shape (n, draws), and the amplitude of each mode's coupling
@@ -67,7 +67,7 @@ class MoveEnd:
     the reference."""
     residual_nm: float
     """Coupling torque in N·m of the residual vibration, with friction, encoder steps and noise."""
-    floor_nm: float
+    noise_floor_nm: float
     """Amplitude in N·m of the coupling torque that noise of the sensor alone exceeds in one of 1000
     ring-downs. A smaller vibration cannot be detected."""
 
@@ -83,11 +83,11 @@ def predict_move_end(rig: DisturbedRig, reference_rad: RealArray, ring_down_s: f
         ringing_poles = rig.poles_rad_s[:1]
     decay_per_s = -ringing_poles.real
     # The loop has followed up and the motor is at rest; from here the amplitudes only decay.
-    measured_tick = end_tick + round(2 * rig.settling_s * rate_hz)
+    measurement_tick = end_tick + round(2 * rig.settling_s * rate_hz)
     held_angle_rad = np.full(
-        max(measured_tick - end_tick + 1, round(_MIN_SIMULATED_S * rate_hz)), reference_rad[-1]
+        max(measurement_tick - end_tick + 1, round(_MIN_SIMULATED_S * rate_hz)), reference_rad[-1]
     )
-    angles_rad, mode_torques_nm = rig.disturbed(
+    angles_rad, mode_torques_nm = rig.respond_disturbed(
         np.concatenate([[0.0], reference_rad, held_angle_rad]), ringing_poles.size
     )
     ticks_outside = np.flatnonzero(
@@ -95,8 +95,8 @@ def predict_move_end(rig: DisturbedRig, reference_rad: RealArray, ring_down_s: f
     )
     arrival_tick = int(ticks_outside[-1]) + 1 if ticks_outside.size else 0
     mode_amplitudes = (
-        mode_torques_nm[measured_tick]
-        * np.exp(decay_per_s * (measured_tick - end_tick) / rate_hz)[:, None]
+        mode_torques_nm[measurement_tick]
+        * np.exp(decay_per_s * (measurement_tick - end_tick) / rate_hz)[:, None]
     )
     # Variance of a decaying cosine's amplitude in white noise, by least squares.
     first_s, last_s = max(arrival_tick - end_tick, 0) / rate_hz, max(ring_down_s, _MIN_RING_DOWN_S)
@@ -109,5 +109,5 @@ def predict_move_end(rig: DisturbedRig, reference_rad: RealArray, ring_down_s: f
     return MoveEnd(
         arrival_s=arrival_tick / rate_hz if arrival_tick < angles_rad.shape[0] - 1 else None,
         residual_nm=float(np.sqrt((mode_amplitudes**2).sum(axis=0).mean())),
-        floor_nm=float(np.sqrt(_SQUARED_AMPLITUDE_1_IN_1000 * amplitude_variances.sum())),
+        floor_nm=float(np.sqrt(_SQUARED_AMPLITUDE_QUANTILE_999 * amplitude_variances.sum())),
     )

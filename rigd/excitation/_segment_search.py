@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rigd.excitation._beam_estimate import BAND_HZ, BeamEstimate
 from rigd.excitation._fisher_information import RecordSoFar, TorqueModel, covariance_of
 from rigd.excitation._shortest_move import MovePlant
-from rigd.excitation._signals import LIMIT_FRACTION, ExcitationError
+from rigd.excitation._signals import MAX_PLANNED_LIMIT_FRACTION, ExcitationError
 from rigd.excitation._sine_mixture import (
     UNREACHABLE_S,
     best_mixture,
@@ -37,20 +37,20 @@ from rigd.excitation.targets import Precision, Quantities
 
 RealArray = NDArray[np.float64]
 
-DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
+SEGMENT_DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
 """Durations in s of the candidate segments."""
 
-SHORTEST_S: Final = DURATIONS_S[0]
+SHORTEST_SEGMENT_S: Final = SEGMENT_DURATIONS_S[0]
 """Duration in s of the shortest segment."""
 
-_SETTLING_S: Final = 0.25
+_CHECKED_SETTLING_S: Final = 0.25
 """Time in s after a segment for which its response is checked against the limits."""
 
-_TAIL_S: Final = 1.0
+_MODE_OBSERVATION_S: Final = 1.0
 """Time in s after a segment from which the vibration of each mode is computed, to bring the modes
 that the segment does not excite to rest."""
 
-HORIZON_S: Final = 8.0
+PLANNING_HORIZON_S: Final = 8.0
 """Planning horizon in s from the start of a segment. A mode gives information on its damping only
 after it has rung for a while."""
 
@@ -60,11 +60,11 @@ _PHASE_COUNT: Final = 8
 _BASE_AMPLITUDE_FACTORS: Final = (1.0, 0.8, 0.5)
 """Factors by which a segment's amplitude is multiplied when a further band is added to it."""
 
-_MIXTURE_EFFICIENCY: Final = 0.7
+_SINE_MIXTURE_EFFICIENCY: Final = 0.7
 """Ratio of the time of a mixture of steady sines to that of segments with the same information, in
 which the modes have to ring up first; a measured value."""
 
-_MAX_RELAXATIONS: Final = 3
+_MAX_TARGET_RELAXATIONS: Final = 3
 """Largest number of times that the targets are relaxed to fit into the remaining time."""
 
 _LIMIT_CHECK_TICKS: Final = 4
@@ -75,7 +75,7 @@ _LIMIT_CHECK_TICKS: Final = 4
 class PrecisionForecast:
     """Forecast of the time in s until all target standard deviations are reached."""
 
-    seconds: float
+    time_to_targets_s: float
     """Time in s until all targets are reached with the best segments; infinite: never."""
     reason: str
     """Reason why the targets are not reached in the remaining time; empty if they are reached."""
@@ -94,14 +94,14 @@ class Segment:
     """Reference angle at each tick, relative to the start angle; shape (n,)."""
     angle_rad: RealArray
     """Predicted angle of the motor at each tick; shape (n,)."""
-    names: tuple[str, ...]
+    parameter_names: tuple[str, ...]
     """Names of the free parameters, in the order of the covariance."""
     covariance: RealArray
     """Covariance of the free parameters that is expected at the end of the segment, shape (k, k);
     see `information` for their units."""
-    now: tuple[Precision, ...]
+    present_precisions: tuple[Precision, ...]
     """Precision of each target that is expected at the beginning of the segment."""
-    expected: tuple[Precision, ...]
+    expected_precisions: tuple[Precision, ...]
     """Precision of each target that is expected at the end of the segment."""
     forecast: PrecisionForecast
     """Forecast of the time from the beginning of the segment until all targets are reached."""
@@ -134,9 +134,9 @@ class SegmentSearch:
         self.model = TorqueModel.for_records(
             estimate, plant.rate_hz, record.ringing_motion.shape[1]
         )
-        self.sample_count = record.future_rows.shape[1]
+        self.sample_count = record.future_derivatives.shape[1]
         self.limits = (
-            LIMIT_FRACTION
+            MAX_PLANNED_LIMIT_FRACTION
             * limit_fraction
             * np.array(
                 [
@@ -163,13 +163,13 @@ class SegmentSearch:
         self.mixture = best_mixture(
             known_information, estimate, quantities, self.line_hz, self.line_amplitudes_rad
         )
-        self.mixture_s = self._mixture_time_s()
+        self.mixture_duration_s = self._mixture_time_s()
         # With too little time all targets are missed by one factor, not the last mode alone.
-        relaxation, mixture_s = 1.0, self.mixture_s
-        for _ in range(_MAX_RELAXATIONS):
-            if not time_left_s < mixture_s < UNREACHABLE_S:
+        relaxation, mixture_duration_s = 1.0, self.mixture_duration_s
+        for _ in range(_MAX_TARGET_RELAXATIONS):
+            if not time_left_s < mixture_duration_s < UNREACHABLE_S:
                 break
-            relaxation *= (mixture_s / time_left_s) ** 0.5
+            relaxation *= (mixture_duration_s / time_left_s) ** 0.5
             self.mixture = best_mixture(
                 known_information,
                 estimate,
@@ -178,10 +178,14 @@ class SegmentSearch:
                 self.line_amplitudes_rad,
                 relaxation,
             )
-            mixture_s = self._mixture_time_s()
-        self.rows_if_held = self.mixture.weights @ record.nuisance_projection @ record.future_rows
+            mixture_duration_s = self._mixture_time_s()
+        self.rows_if_held = (
+            self.mixture.weights @ record.nuisance_projection @ record.future_derivatives
+        )
         self._continued_drives: dict[float, ContinuedDrive] = {}
-        self.tip_slope = self.ringing_fractions[-1, :: self.model.sample_ticks][: self.sample_count]
+        self.tip_slope = self.ringing_fractions[-1, :: self.model.ticks_per_model_sample][
+            : self.sample_count
+        ]
 
     def best_candidate(
         self, time_left_s: float, mode_numbers: Collection[int] = ()
@@ -190,15 +194,15 @@ class SegmentSearch:
 
         It drives one of the modes in `mode_numbers`, or any mode if `mode_numbers` is empty.
         """
-        durations_s = [d for d in DURATIONS_S if d <= time_left_s + 1e-9]
+        durations_s = [d for d in SEGMENT_DURATIONS_S if d <= time_left_s + 1e-9]
         if not durations_s:
             raise ExcitationError(
                 f"No segment of excitation fits into {time_left_s:g} s: the shortest takes "
-                f"{DURATIONS_S[0]:g} s."
+                f"{SEGMENT_DURATIONS_S[0]:g} s."
             )
         return max(
             (self.best_of_duration(d, mode_numbers) for d in durations_s),
-            key=lambda each: each.information_s,
+            key=lambda candidate: candidate.information_s,
         )
 
     def best_of_duration(
@@ -216,7 +220,9 @@ class SegmentSearch:
             duration_s,
             (),
             (),
-            self.ringing_fractions[:, : self.ticks(duration_s + _SETTLING_S) : _LIMIT_CHECK_TICKS],
+            self.ringing_fractions[
+                :, : self.to_ticks(duration_s + _CHECKED_SETTLING_S) : _LIMIT_CHECK_TICKS
+            ],
             self.rows_if_held,
             self.tip_slope,
             0.0,
@@ -232,7 +238,7 @@ class SegmentSearch:
             for sweep_band, _ in sweep_pairs
             if sweep_band.at_mode and sweep_band.mode_number in mode_numbers
         }
-        candidates_at_rest = {
+        start_candidate_by_mode = {
             mode_number: self.with_modes_at_rest(empty_candidate, mode_number, mode_sweeps)
             for mode_number in mode_sweeps
         }
@@ -242,10 +248,13 @@ class SegmentSearch:
                 for sweep_band, sweep_pair in sweep_pairs
                 if sweep_band.at_mode
                 and (not mode_numbers or sweep_band is resonance_bands.get(sweep_band.mode_number))
-                for start_candidate in (empty_candidate, candidates_at_rest[sweep_band.mode_number])
+                for start_candidate in (
+                    empty_candidate,
+                    start_candidate_by_mode[sweep_band.mode_number],
+                )
                 for phase_index in range(_PHASE_COUNT)
             ),
-            key=lambda each: each.information_s,
+            key=lambda candidate: candidate.information_s,
         )
         for _ in range(2):
             driven_modes = {sweep_band.mode_number for sweep_band, _ in leading_candidate.parts}
@@ -259,18 +268,20 @@ class SegmentSearch:
                 for phase_index in range(0, _PHASE_COUNT, 2)
             ]
             better_candidate = max(
-                extended_candidates, key=lambda each: each.information_s, default=leading_candidate
+                extended_candidates,
+                key=lambda candidate: candidate.information_s,
+                default=leading_candidate,
             )
             if better_candidate.information_s <= leading_candidate.information_s:
                 break
             leading_candidate = better_candidate
         return leading_candidate
 
-    def ticks(self, time_s: float) -> int:
+    def to_ticks(self, time_s: float) -> int:
         """Return a time in s as a number of ticks of the rig."""
         return round(time_s * self.plant.rate_hz)
 
-    def model_samples(self, time_s: float) -> int:
+    def to_model_samples(self, time_s: float) -> int:
         """Return a time in s as a number of samples of the torque model."""
         return round(time_s * self.model.sample_hz)
 
@@ -292,20 +303,20 @@ class SegmentSearch:
         ]
         if not other_sweeps:
             return start_candidate
-        first_sample = self.model_samples(start_candidate.duration_s)
-        tail_samples = slice(first_sample, first_sample + self.model_samples(_TAIL_S))
+        first_sample = self.to_model_samples(start_candidate.duration_s)
+        tail_slice = slice(first_sample, first_sample + self.to_model_samples(_MODE_OBSERVATION_S))
         # One second of the tip's slope suffices to separate the modes.
         tip_slopes = np.stack(
-            [other_sweep.slope[tail_samples] for other_sweep in other_sweeps], axis=1
+            [other_sweep.slope[tail_slice] for other_sweep in other_sweeps], axis=1
         )
-        present_slope = self.tip_slope[tail_samples]
+        present_slope = self.tip_slope[tail_slice]
         sweep_factors = -np.linalg.lstsq(tip_slopes, present_slope)[0]
         summed_channels = sum(
             f * other_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
             for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
         )
         amplitude_fraction = min(1.0, largest_factor(start_candidate.channels, summed_channels))
-        summed_weighted = sum(
+        summed_weighted_rows = sum(
             f * other_sweep.weighted_rows
             for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
         )
@@ -317,7 +328,7 @@ class SegmentSearch:
                 for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
             ),
             start_candidate.channels + amplitude_fraction * summed_channels,
-            start_candidate.weighted_rows + amplitude_fraction * summed_weighted,
+            start_candidate.weighted_rows + amplitude_fraction * summed_weighted_rows,
             start_candidate.tip_slope
             + amplitude_fraction
             * sum(
@@ -330,13 +341,13 @@ class SegmentSearch:
     def sweep_pair(self, sweep_band: SweepBand, duration_s: float) -> tuple[UnitSweep, UnitSweep]:
         """Return two sweeps of 1 rad through a band, a quarter of a period apart in phase."""
         rate_hz = self.plant.rate_hz
-        n = self.ticks(duration_s)
-        from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
-        phase_rad = 2 * pi * sweep_band.middle_hz * from_middle_s
-        phase_rad += 2 * pi * sweep_band.half_width_hz * from_middle_s**2 / duration_s
+        n = self.to_ticks(duration_s)
+        time_from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
+        phase_rad = 2 * pi * sweep_band.middle_hz * time_from_middle_s
+        phase_rad += 2 * pi * sweep_band.half_width_hz * time_from_middle_s**2 / duration_s
         fade_factors = quintic(min(sweep_band.fade_s, 0.4 * duration_s), rate_hz)
         # The motor comes to rest as well before the segment ends.
-        end_tick = n - self.ticks(self.plant.settling_s)
+        end_tick = n - self.to_ticks(self.plant.settling_s)
         fade_window = np.zeros(n)
         fade_window[:end_tick] = 1.0
         fade_window[: fade_factors.size] = fade_factors
@@ -351,7 +362,7 @@ class SegmentSearch:
         """Return the predicted response to a reference of amplitude 1 rad from rest, shape (n,)."""
         n = reference_rad.size
         extended_reference_rad = np.concatenate(
-            [reference_rad, np.zeros(round(_SETTLING_S * self.plant.rate_hz))]
+            [reference_rad, np.zeros(round(_CHECKED_SETTLING_S * self.plant.rate_hz))]
         )
         loop_response = self.plant.respond(extended_reference_rad)
         spectrum = self.model.spectrum(loop_response.angle_rad)
@@ -372,7 +383,8 @@ class SegmentSearch:
             angle_rad=loop_response.angle_rad[:n],
             rows=whitened_rows,
             weighted_rows=self.mixture.weights @ whitened_rows,
-            slope=slope_rad[:: self.model.sample_ticks][: self.sample_count] / self.limits[-1],
+            slope=slope_rad[:: self.model.ticks_per_model_sample][: self.sample_count]
+            / self.limits[-1],
             channels=limit_channels / self.limits[:, None],
         )
 
@@ -453,7 +465,7 @@ class SegmentSearch:
 
         After the segment the motor holds the amplitude that the band's mode has at its end.
         """
-        first_sample = self.model_samples(duration_s)
+        first_sample = self.to_model_samples(duration_s)
         remaining_samples = self.sample_count - first_sample
         continued_drive = self.continued_drive(sweep_band)
         mode_amplitudes = (
@@ -464,11 +476,14 @@ class SegmentSearch:
         drive_factors = (
             continued_drive.drive_per_amplitude @ mode_amplitudes[mode_row : mode_row + 2]
         )
-        rows_before = weighted_rows[:, :first_sample]
-        rows_after = weighted_rows[:, first_sample:] + np.tensordot(
+        rows_within_segment = weighted_rows[:, :first_sample]
+        rows_after_segment = weighted_rows[:, first_sample:] + np.tensordot(
             drive_factors, continued_drive.weighted_rows[:, :, :remaining_samples], axes=1
         )
-        return float(np.vdot(rows_before, rows_before) + np.vdot(rows_after, rows_after))
+        return float(
+            np.vdot(rows_within_segment, rows_within_segment)
+            + np.vdot(rows_after_segment, rows_after_segment)
+        )
 
     @cached_property
     def amplitude_matrix(self) -> RealArray:
@@ -476,7 +491,7 @@ class SegmentSearch:
 
         The shape is (2 m, n), with a row each for real and imaginary part of the m amplitudes.
         """
-        time_s = np.arange(self.model_samples(_TAIL_S)) / self.model.sample_hz
+        time_s = np.arange(self.to_model_samples(_MODE_OBSERVATION_S)) / self.model.sample_hz
         free_oscillations = np.exp(
             np.outer([beam_mode.at_rad_s for beam_mode in self.modes], time_s)
         )
@@ -488,15 +503,15 @@ class SegmentSearch:
     def continued_drive(self, sweep_band: SweepBand) -> ContinuedDrive:
         """Return the response to exciting a band's mode by a sine up to the planning horizon."""
         if sweep_band.middle_hz not in self._continued_drives:
-            duration_s = HORIZON_S - DURATIONS_S[0]
+            duration_s = PLANNING_HORIZON_S - SEGMENT_DURATIONS_S[0]
             sine_pair = self.sweep_pair(replace(sweep_band, half_width_hz=0.0), duration_s)
             weighted_rows = np.stack([sine_sweep.weighted_rows for sine_sweep in sine_pair])
             driven_mode = next(
                 beam_mode for beam_mode in self.modes if beam_mode.mode == sweep_band.mode_number
             )
-            end_sample = self.model_samples(duration_s - FADE_S)
-            tail_window = slice(end_sample - self.model_samples(_TAIL_S), end_sample)
-            time_s = np.arange(tail_window.start, tail_window.stop) / self.model.sample_hz
+            end_sample = self.to_model_samples(duration_s - FADE_S)
+            tail_slice = slice(end_sample - self.to_model_samples(_MODE_OBSERVATION_S), end_sample)
+            time_s = np.arange(tail_slice.start, tail_slice.stop) / self.model.sample_hz
             # Fraction of the steady amplitude that the mode has reached by then.
             ring_up_fraction = 1.0 - np.exp(driven_mode.at_rad_s.real * (time_s - 0.5 * FADE_S))
             oscillation = np.exp(1j * driven_mode.at_rad_s.imag * time_s)
@@ -504,7 +519,7 @@ class SegmentSearch:
                 np.stack([oscillation.real, -oscillation.imag], axis=1) * ring_up_fraction[:, None]
             )
             tip_slopes = np.stack(
-                [sine_sweep.slope[tail_window] for sine_sweep in sine_pair], axis=1
+                [sine_sweep.slope[tail_slice] for sine_sweep in sine_pair], axis=1
             )
             drive_per_amplitude = np.linalg.inv(np.linalg.lstsq(oscillation_columns, tip_slopes)[0])
             self._continued_drives[sweep_band.middle_hz] = ContinuedDrive(
@@ -515,7 +530,7 @@ class SegmentSearch:
     def segment(self, chosen_candidate: SegmentCandidate, time_left_s: float) -> Segment:
         """Return a candidate as a segment, with the standard deviations expected after it."""
         estimate, quantities = self.estimate, self.quantities
-        segment_samples = self.model_samples(chosen_candidate.duration_s)
+        segment_samples = self.to_model_samples(chosen_candidate.duration_s)
         segment_channels = chosen_candidate.weighted_sum("channels")
         ringing_channels = self.ringing_fractions[:, : segment_channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
@@ -531,12 +546,12 @@ class SegmentSearch:
             name=describe_candidate(chosen_candidate),
             reference_rad=amplitude_fraction * chosen_candidate.weighted_sum("reference_rad"),
             angle_rad=amplitude_fraction * chosen_candidate.weighted_sum("angle_rad"),
-            names=estimate.names,
+            parameter_names=estimate.free_parameters,
             covariance=later_covariance,
-            now=quantities.precisions(present_covariance),
-            expected=quantities.precisions(later_covariance),
+            present_precisions=quantities.precisions(present_covariance),
+            expected_precisions=quantities.precisions(later_covariance),
             forecast=self.forecast(time_left_s),
-            fraction_of_limits=LIMIT_FRACTION
+            fraction_of_limits=MAX_PLANNED_LIMIT_FRACTION
             * self.limit_fraction
             * float(np.abs(ringing_channels + amplitude_fraction * segment_channels).max()),
         )
@@ -544,7 +559,7 @@ class SegmentSearch:
     def _mixture_time_s(self) -> float:
         """Return the time in s that segments need for the information of the best mixture."""
         ring_up_s = time_with_ring_up(self.mixture.times_s, self.line_hz, self.modes)
-        return ring_up_s / _MIXTURE_EFFICIENCY
+        return ring_up_s / _SINE_MIXTURE_EFFICIENCY
 
     def forecast(self, time_left_s: float) -> PrecisionForecast:
         """Return the forecast of the time in s until all target standard deviations are reached."""
@@ -553,7 +568,7 @@ class SegmentSearch:
         ]
         if impossible_reasons:
             return PrecisionForecast(inf, impossible_reasons[0])
-        forecast_s = self.mixture_s
+        forecast_s = self.mixture_duration_s
         if not forecast_s < UNREACHABLE_S:
             return PrecisionForecast(inf, "the motor cannot excite the modes that determine it")
         if forecast_s <= time_left_s:

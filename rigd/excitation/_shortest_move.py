@@ -14,7 +14,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation._signals import LIMIT_FRACTION, ExcitationError
+from rigd.excitation._signals import MAX_PLANNED_LIMIT_FRACTION, ExcitationError
 from rigd.excitation.moves import (
     ROBUST_BELOW_HZ,
     Braking,
@@ -33,9 +33,9 @@ ComplexArray = NDArray[np.complexfloating]
 LONGEST_MOVE_S: Final = 60.0
 """Longest duration of a move in s; a longer one is an error."""
 
-_MIN_INTERVAL_S: Final = 2e-3
+_MIN_ACCELERATION_INTERVAL_S: Final = 2e-3
 """Shortest time in s for which the acceleration is constant; it is longer in long moves."""
-_MAX_INTERVALS: Final = 60
+_MAX_ACCELERATION_INTERVALS: Final = 60
 """Largest number of intervals of constant acceleration, the unknowns of the linear programme."""
 _CONVERGED_DURATION_RATIO: Final = 1.03
 """Ratio of a sufficient duration to an insufficient one at which the search for the shortest move
@@ -43,7 +43,7 @@ ends."""
 _CONVERGED_LIMIT_FRACTION: Final = 0.93
 """Fraction of the limits that a move must use for the search to end: a duration shorter by 4 %
 would exceed the limits."""
-_MAX_ROUNDS: Final = 14
+_MAX_TRIED_DURATIONS: Final = 14
 """Largest number of durations that the search tries."""
 _MAX_BACKWARD_SPEED_FRACTION: Final = 0.01
 """Largest backward speed of a robust move, as a fraction of its mean speed."""
@@ -53,7 +53,7 @@ _BRAKING_DURATIONS_S: Final = (0.02, 5.0)
 """Shortest and longest duration in s of a braking path that is tried."""
 
 
-class Response(Protocol):
+class PlannedResponse(Protocol):
     """Interface to the closed loop's response to a reference: arrays (n,), one value a tick."""
 
     @property
@@ -79,10 +79,10 @@ class MovePlant:
 
     rate_hz: float
     """Ticks a second."""
-    respond: Callable[[RealArray], Response]
+    respond: Callable[[RealArray], PlannedResponse]
     """Function that returns the response of the closed loop to a reference in rad, shape (n,), from
     rest and without friction."""
-    disturbed: Callable[[RealArray, int], tuple[RealArray, RealArray]]
+    respond_disturbed: Callable[[RealArray, int], tuple[RealArray, RealArray]]
     """Function that returns the response to a reference in rad, shape (n,), from rest with
     friction, encoder steps and noise, in several random draws. The second argument is the number of
     lowest modes. The result is the angle in rad, shape (n, draws), and the amplitude of each mode's
@@ -125,7 +125,8 @@ class Move:
     duration_s: float
     """Duration of the move in s."""
     limit_fraction: float
-    """Largest fraction of a limit that the move is predicted to use; at most `LIMIT_FRACTION`."""
+    """Largest fraction of a limit that the move is predicted to use, at most
+    `MAX_PLANNED_LIMIT_FRACTION`."""
     residual_nm: float
     """Coupling torque in N·m of the vibration after the move in the linear loop: the sum of the
     modes' amplitudes, each for a frequency that is wrong by its standard uncertainty."""
@@ -139,7 +140,7 @@ def shortest_move(
     *,
     start_rad: float = 0.0,
     robust: bool = False,
-    ringing: ComplexArray | None = None,
+    initial_modal_states: ComplexArray | None = None,
 ) -> Move:
     """Plan the shortest move within a rig's limits that leaves no vibration.
 
@@ -154,7 +155,7 @@ def shortest_move(
     robust
         Whether the move has zeros of second order for the modes below `ROBUST_BELOW_HZ`, to
         tolerate a 1 % frequency error, and does not turn back. It then takes longer.
-    ringing
+    initial_modal_states
         Complex state of the modes at the start as `modal_state` returns it, shape (m,), which the
         move cancels; None: the modes are at rest.
 
@@ -169,7 +170,9 @@ def shortest_move(
     T. D. Tuttle and W. P. Seering, Journal of Guidance, Control, and Dynamics 17 (1994) 1032, with
     the limits of the rig instead of an impulse's.
     """
-    move_search = _MoveSearch(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
+    move_search = _MoveSearch(
+        plant, distance_rad, start_rad, 2 if robust else 1, initial_modal_states
+    )
     accelerations_rad_s2 = move_search.shortest_accelerations()
     reference_rad = from_acceleration(accelerations_rad_s2, plant.rate_hz)
     n = reference_rad.size
@@ -178,8 +181,8 @@ def shortest_move(
         reference_rad=reference_rad,
         duration_s=n / plant.rate_hz,
         limit_fraction=move_search.limit_fraction(reference_rad),
-        residual_nm=_residual_torque_nm(plant, reference_rad, ringing),
-        quintic_residual_nm=_residual_torque_nm(plant, quintic_rad, ringing),
+        residual_nm=_residual_torque_nm(plant, reference_rad, initial_modal_states),
+        quintic_residual_nm=_residual_torque_nm(plant, quintic_rad, initial_modal_states),
     )
 
 
@@ -212,13 +215,13 @@ class _MoveSearch:
         plant: MovePlant,
         distance_rad: float,
         start_rad: float,
-        zero_order: int,
+        order_of_zeros: int,
         initial_states: ComplexArray | None,
     ) -> None:
         self._plant = plant
         self._distance_rad = distance_rad
         self._start_rad = start_rad
-        self._zero_order = zero_order
+        self._order_of_zeros = order_of_zeros
         self._initial_states = initial_states
         self._unit_response = _UnitResponse(plant)
         ringing_torque_nm = 0.0
@@ -226,10 +229,12 @@ class _MoveSearch:
             ringing_torque_nm = float(np.abs(initial_states) @ plant.torque_per_state_nm_s)
         # The remaining vibration is fed forward to the motor, and is in the sensor's reading.
         self._limits = {
-            "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - ringing_torque_nm,
-            "velocity": LIMIT_FRACTION * plant.velocity_rad_s,
-            "tracking": LIMIT_FRACTION * plant.tracking_error_rad,
-            "coupling": LIMIT_FRACTION * plant.coupling_torque_nm - ringing_torque_nm,
+            "torque": MAX_PLANNED_LIMIT_FRACTION * plant.peak_torque_nm
+            - plant.friction_nm
+            - ringing_torque_nm,
+            "velocity": MAX_PLANNED_LIMIT_FRACTION * plant.velocity_rad_s,
+            "tracking": MAX_PLANNED_LIMIT_FRACTION * plant.tracking_error_rad,
+            "coupling": MAX_PLANNED_LIMIT_FRACTION * plant.coupling_torque_nm - ringing_torque_nm,
         }
         if min(self._limits.values()) <= 0.0:
             raise ExcitationError(
@@ -244,41 +249,43 @@ class _MoveSearch:
         """
         rate_hz = self._plant.rate_hz
         longest_ticks = round(LONGEST_MOVE_S * rate_hz)
-        slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
-        n = round((1.0 if self._zero_order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
-        too_short_ticks, sufficient_ticks, fraction_short, fraction_sufficient = (
+        lowest_pole_rad_s = float(np.abs(self._plant.poles_rad_s).min())
+        move_ticks = round(
+            (1.0 if self._order_of_zeros == 1 else 2.35) * rate_hz * np.pi / lowest_pole_rad_s
+        )
+        too_short_ticks, sufficient_ticks, limit_fraction_too_short, limit_fraction_sufficient = (
             8,
             longest_ticks + 1,
             inf,
             0.0,
         )
         best_accelerations: RealArray | None = None
-        for _ in range(_MAX_ROUNDS):
-            used_fraction, accelerations = self._least_limit_fraction(n)
-            if used_fraction <= 1.0:
-                sufficient_ticks, fraction_sufficient, best_accelerations = (
-                    n,
-                    used_fraction,
+        for _ in range(_MAX_TRIED_DURATIONS):
+            used_limit_fraction, accelerations = self._least_limit_fraction(move_ticks)
+            if used_limit_fraction <= 1.0:
+                sufficient_ticks, limit_fraction_sufficient, best_accelerations = (
+                    move_ticks,
+                    used_limit_fraction,
                     accelerations,
                 )
             else:
-                too_short_ticks, fraction_short = n, used_fraction
-            if fraction_sufficient >= _CONVERGED_LIMIT_FRACTION or sufficient_ticks <= max(
+                too_short_ticks, limit_fraction_too_short = move_ticks, used_limit_fraction
+            if limit_fraction_sufficient >= _CONVERGED_LIMIT_FRACTION or sufficient_ticks <= max(
                 _CONVERGED_DURATION_RATIO * too_short_ticks, too_short_ticks + 1
             ):
                 break
             if too_short_ticks >= longest_ticks:
                 break
-            n = _next_duration_ticks(
+            move_ticks = _next_duration_ticks(
                 too_short_ticks,
                 sufficient_ticks,
-                fraction_short,
-                fraction_sufficient,
-                n,
-                used_fraction,
-                self._zero_order,
+                limit_fraction_too_short,
+                limit_fraction_sufficient,
+                move_ticks,
+                used_limit_fraction,
+                self._order_of_zeros,
             )
-            n = min(n, longest_ticks)
+            move_ticks = min(move_ticks, longest_ticks)
         if best_accelerations is None:
             raise ExcitationError(
                 f"No move of at most {LONGEST_MOVE_S:g} s by {self._distance_rad:g} rad stays "
@@ -287,7 +294,7 @@ class _MoveSearch:
             )
         return best_accelerations
 
-    def _least_limit_fraction(self, n: int) -> tuple[float, RealArray | None]:
+    def _least_limit_fraction(self, move_ticks: int) -> tuple[float, RealArray | None]:
         """Solve the linear programme for a move of n ticks.
 
         Return the smallest fraction of the limits that such a move uses, and its accelerations in
@@ -296,45 +303,47 @@ class _MoveSearch:
         from scipy.optimize import linprog
 
         plant, rate_hz = self._plant, self._plant.rate_hz
-        interval_ticks = max(1, round(_MIN_INTERVAL_S * rate_hz))
-        interval_count = min(ceil(n / interval_ticks), _MAX_INTERVALS)
-        edge_ticks = np.round(np.linspace(0, n, interval_count + 1)).astype(int)
+        interval_ticks = max(1, round(_MIN_ACCELERATION_INTERVAL_S * rate_hz))
+        interval_count = min(ceil(move_ticks / interval_ticks), _MAX_ACCELERATION_INTERVALS)
+        edge_ticks = np.round(np.linspace(0, move_ticks, interval_count + 1)).astype(int)
         acceleration_scale = plant.largest_acceleration_rad_s2
 
-        vibration_map = residual_vibration_map(n, rate_hz, plant.poles_rad_s, self._zero_order)
+        vibration_map = residual_vibration_map(
+            move_ticks, rate_hz, plant.poles_rad_s, self._order_of_zeros
+        )
         vibration_per_interval = (
             np.add.reduceat(vibration_map, edge_ticks[:-1], axis=1) * acceleration_scale
         )
         interval_s = np.diff(edge_ticks) / rate_hz
         # The centre of an interval's held acceleration, as `from_acceleration` sums them up.
-        remaining_s = (n - (edge_ticks[:-1] + edge_ticks[1:] - 1) / 2) / rate_hz
+        time_to_end_s = (move_ticks - (edge_ticks[:-1] + edge_ticks[1:] - 1) / 2) / rate_hz
         equality_matrix = np.concatenate(
             [
                 [interval_s * acceleration_scale],
-                [interval_s * remaining_s * acceleration_scale],
+                [interval_s * time_to_end_s * acceleration_scale],
                 vibration_per_interval,
             ]
         )
         equality_values = np.zeros(len(equality_matrix))
         equality_values[1] = self._distance_rad
         if self._initial_states is not None:
-            equality_values[2:] = np.negative(self._ringing_rows(n))
+            equality_values[2:] = np.negative(self._ringing_rows(move_ticks))
         row_norms = np.linalg.norm(equality_matrix, axis=1)
 
-        limited_map, bounded_map, bound_values = self._inequalities(
-            n, edge_ticks, acceleration_scale
+        limit_fraction_map, bounded_map, bound_values = self._inequalities(
+            move_ticks, edge_ticks, acceleration_scale
         )
-        limited_map = np.concatenate([limited_map, np.eye(interval_count)])
-        fraction_column = -np.ones((len(limited_map), 1))
+        limit_fraction_map = np.concatenate([limit_fraction_map, np.eye(interval_count)])
+        fraction_column = -np.ones((len(limit_fraction_map), 1))
         zero_column = np.zeros((len(bounded_map), 1))
         inequality_matrix = np.block(
             [
-                [limited_map, fraction_column],
-                [-limited_map, fraction_column],
+                [limit_fraction_map, fraction_column],
+                [-limit_fraction_map, fraction_column],
                 [bounded_map, zero_column],
             ]
         )
-        upper_bounds = np.concatenate([np.zeros(2 * len(limited_map)), bound_values])
+        upper_bounds = np.concatenate([np.zeros(2 * len(limit_fraction_map)), bound_values])
         optimum = linprog(
             np.append(np.zeros(interval_count), 1.0),
             A_ub=inequality_matrix,
@@ -352,7 +361,7 @@ class _MoveSearch:
             optimum.x[:-1] * acceleration_scale, np.diff(edge_ticks)
         )
 
-    def _ringing_rows(self, n: int) -> list[float]:
+    def _ringing_rows(self, move_ticks: int) -> list[float]:
         """Return the modes' complex states to which the initial vibration decays during a move.
 
         Real and imaginary parts are in the order of the rows of `residual_vibration_map`.
@@ -362,17 +371,19 @@ class _MoveSearch:
         for mode_pole, mode_state in zip(
             self._plant.poles_rad_s, self._initial_states, strict=True
         ):
-            end_state = mode_state * np.exp(mode_pole * n / self._plant.rate_hz)
+            end_state = mode_state * np.exp(mode_pole * move_ticks / self._plant.rate_hz)
             # The row of the derivative weighs the start by 1.
-            second_order = self._zero_order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
-            for _ in range(2 if second_order else 1):
+            has_second_order_zero = (
+                self._order_of_zeros > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
+            )
+            for _ in range(2 if has_second_order_zero else 1):
                 state_rows += (
                     [end_state.real, end_state.imag] if mode_pole.imag != 0.0 else [end_state.real]
                 )
         return state_rows
 
     def _inequalities(
-        self, n: int, edge_ticks: NDArray[np.intp], acceleration_scale: float
+        self, move_ticks: int, edge_ticks: NDArray[np.intp], acceleration_scale: float
     ) -> tuple[RealArray, RealArray, RealArray]:
         """Return the inequalities of the linear programme for a move of n ticks.
 
@@ -385,20 +396,24 @@ class _MoveSearch:
         angle.
         """
         plant = self._plant
-        end_tick = n + round(plant.settling_s * plant.rate_hz)
+        end_tick = move_ticks + round(plant.settling_s * plant.rate_hz)
         # The ends of all intervals and the ticks between them: the solution exploits every gap.
         interval_middles = np.round((edge_ticks[:-1] + edge_ticks[1:]) / 2).astype(int)
-        settling_ticks = np.arange(n, end_tick, max(1, ceil(n / len(edge_ticks))))[
-            : _MAX_INTERVALS // 2
-        ]
+        settling_ticks = np.arange(
+            move_ticks, end_tick, max(1, ceil(move_ticks / len(edge_ticks)))
+        )[: _MAX_ACCELERATION_INTERVALS // 2]
         checked_ticks = np.unique(
             np.concatenate(
-                [edge_ticks, interval_middles if n > 2 * len(edge_ticks) else [], settling_ticks]
+                [
+                    edge_ticks,
+                    interval_middles if move_ticks > 2 * len(edge_ticks) else [],
+                    settling_ticks,
+                ]
             )
         )
         checked_ticks = checked_ticks.astype(int)
         every_second_tick = checked_ticks[::2]
-        unit_responses = self._unit_response.for_ticks(end_tick)
+        unit_responses = self._unit_response.responses_for_ticks(end_tick)
         limited_rows = [
             _interval_responses(
                 unit_responses[limit_name],
@@ -408,12 +423,12 @@ class _MoveSearch:
             * (acceleration_scale / self._limits[limit_name])
             for limit_name in self._limits
         ]
-        if self._zero_order > 1 and self._initial_states is None:
+        if self._order_of_zeros > 1 and self._initial_states is None:
             forward_scale = np.copysign(acceleration_scale, self._distance_rad)
             backward_speed_map = -forward_scale * _interval_responses(
                 unit_responses["velocity"], edge_ticks, every_second_tick
             )
-            mean_speed_rad_s = abs(self._distance_rad) * plant.rate_hz / n
+            mean_speed_rad_s = abs(self._distance_rad) * plant.rate_hz / move_ticks
             return (
                 np.concatenate(limited_rows),
                 backward_speed_map,
@@ -422,25 +437,26 @@ class _MoveSearch:
         angle_map = acceleration_scale * _interval_responses(
             unit_responses["angle"], edge_ticks, every_second_tick
         )
-        free_angles_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
+        angle_margins_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
         return (
             np.concatenate(limited_rows),
             np.vstack([angle_map, -angle_map]),
-            np.repeat(free_angles_rad, len(every_second_tick)),
+            np.repeat(angle_margins_rad, len(every_second_tick)),
         )
 
     def limit_fraction(self, reference_rad: RealArray) -> float:
         """Return the largest fraction of a rig's limit that the response to a reference reaches."""
         plant = self._plant
-        held_ticks = round(plant.settling_s * plant.rate_hz)
-        whole_reference_rad = np.concatenate(
-            [[0.0], reference_rad, np.full(held_ticks, reference_rad[-1])]
+        settling_tick_count = round(plant.settling_s * plant.rate_hz)
+        extended_reference_rad = np.concatenate(
+            [[0.0], reference_rad, np.full(settling_tick_count, reference_rad[-1])]
         )
-        loop_response = plant.respond(whole_reference_rad)
+        loop_response = plant.respond(extended_reference_rad)
         peak_fractions = (
             (np.abs(loop_response.torque_nm).max() + plant.friction_nm) / plant.peak_torque_nm,
             np.abs(loop_response.velocity_rad_s).max() / plant.velocity_rad_s,
-            np.abs(whole_reference_rad - loop_response.angle_rad).max() / plant.tracking_error_rad,
+            np.abs(extended_reference_rad - loop_response.angle_rad).max()
+            / plant.tracking_error_rad,
             np.abs(loop_response.coupling_torque_nm).max() / plant.coupling_torque_nm,
             np.abs(self._start_rad + loop_response.angle_rad).max() / plant.angle_rad,
         )
@@ -450,11 +466,11 @@ class _MoveSearch:
 def _next_duration_ticks(
     too_short_ticks: int,
     sufficient_ticks: int,
-    fraction_short: float,
-    fraction_sufficient: float,
-    n: int,
-    used_fraction: float,
-    zero_order: int,
+    limit_fraction_too_short: float,
+    limit_fraction_sufficient: float,
+    move_ticks: int,
+    used_limit_fraction: float,
+    order_of_zeros: int,
 ) -> int:
     """Return the duration in ticks that the search for the shortest move tries next.
 
@@ -463,18 +479,22 @@ def _next_duration_ticks(
     power of the duration: about the third, and more if the modes, not the distance, determine the
     duration.
     """
-    if fraction_sufficient == 0.0:  # none has sufficed yet
-        return int(max(n + 2, round(1.03 * n * min(used_fraction, 4.0) ** 0.3)))
-    if fraction_short == inf and n == sufficient_ticks:
-        guessed_ticks = round(n * max(used_fraction, 0.02) ** (0.08 if zero_order > 1 else 0.22))
-    elif fraction_short == inf:
+    if limit_fraction_sufficient == 0.0:  # none has sufficed yet
+        return int(
+            max(move_ticks + 2, round(1.03 * move_ticks * min(used_limit_fraction, 4.0) ** 0.3))
+        )
+    if limit_fraction_too_short == inf and move_ticks == sufficient_ticks:
+        guessed_ticks = round(
+            move_ticks * max(used_limit_fraction, 0.02) ** (0.08 if order_of_zeros > 1 else 0.22)
+        )
+    elif limit_fraction_too_short == inf:
         guessed_ticks = round((too_short_ticks * sufficient_ticks) ** 0.5)
     else:
-        duration_power = np.log(fraction_short / fraction_sufficient) / np.log(
+        duration_power = np.log(limit_fraction_too_short / limit_fraction_sufficient) / np.log(
             sufficient_ticks / too_short_ticks
         )
         guessed_ticks = round(
-            1.004 * sufficient_ticks * fraction_sufficient ** (1.0 / duration_power)
+            1.004 * sufficient_ticks * limit_fraction_sufficient ** (1.0 / duration_power)
         )
     return int(min(max(guessed_ticks, too_short_ticks + 1), sufficient_ticks - 1))
 
@@ -487,7 +507,7 @@ class _UnitResponse:
         self._rows: dict[str, RealArray] = {}
         self._ticks = 0
 
-    def for_ticks(self, tick_count: int) -> dict[str, RealArray]:
+    def responses_for_ticks(self, tick_count: int) -> dict[str, RealArray]:
         """Return the response of each quantity by name, for at least the given number of ticks."""
         if tick_count > self._ticks:
             self._ticks = max(2 * tick_count, 1024)
@@ -542,7 +562,7 @@ def shortest_braking(plant: MovePlant, reference_rad: RealArray) -> Braking:
     The closed loop is simulated with braking from ticks all along the reference. During braking the
     torque is linear in speed and acceleration of the reference at the start.
     """
-    held_reference = np.zeros(round(plant.settling_s * plant.rate_hz))
+    zero_reference = np.zeros(round(plant.settling_s * plant.rate_hz))
     start_ticks = np.unique(
         np.linspace(2, reference_rad.size - 1, _BRAKING_START_COUNT).astype(int)
     )
@@ -554,7 +574,7 @@ def shortest_braking(plant: MovePlant, reference_rad: RealArray) -> Braking:
         for start_tick in start_ticks:
             braked_path_rad = braked_reference(reference_rad, int(start_tick), braking_law)
             loop_response = plant.respond(
-                np.concatenate([braked_path_rad, held_reference + braked_path_rad[-1]])
+                np.concatenate([braked_path_rad, zero_reference + braked_path_rad[-1]])
             )
             torque_fraction = max(
                 torque_fraction, float(np.abs(loop_response.torque_nm).max()) / available_torque_nm

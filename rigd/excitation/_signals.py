@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-SAMPLES_PER_PERIOD = 4
+MIN_SAMPLES_PER_PERIOD = 4
 """Smallest number of samples in a period of the reference; with fewer samples the reference no
 longer resembles a sine."""
 
-LIMIT_FRACTION = 0.9
+MAX_PLANNED_LIMIT_FRACTION = 0.9
 """Largest fraction of each of the rig's limits that the predicted motion may use. The remainder is
 for a beam that differs from the predicted beam."""
 
@@ -186,14 +186,14 @@ def require_frequency(
     With `zero_allowed`, 0 Hz is valid as well.
     """
     require_finite(option, value, "Hz")
-    highest_hz = rate_hz / SAMPLES_PER_PERIOD
+    max_frequency_hz = rate_hz / MIN_SAMPLES_PER_PERIOD
     if not (value > 0.0 or (zero_allowed and value == 0.0)):
         bound_text = "must not be negative" if zero_allowed else "must be more than 0 Hz"
         raise ExcitationError(f"{option} = {value:g} Hz {bound_text}.")
-    if value > highest_hz:
+    if value > max_frequency_hz:
         raise ExcitationError(
-            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples per period at "
-            f"{rate_hz:g} Hz; choose at most {highest_hz:g} Hz."
+            f"{option} = {value:g} Hz leaves fewer than {MIN_SAMPLES_PER_PERIOD} samples per "
+            f"period at {rate_hz:g} Hz; choose at most {max_frequency_hz:g} Hz."
         )
 
 

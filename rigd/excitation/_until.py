@@ -13,7 +13,7 @@ from annotated_types import doc
 from numpy.typing import NDArray
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
-from rigd.beam.tip import SMALL_SLOPE_RAD
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._options import RestS, documented
 from rigd.excitation._signals import (
@@ -146,7 +146,7 @@ def until(
             "Largest slope of the beam's free end. The scan is predicted to use up to 80 % of it, "
             "a segment up to 77 %. Beyond the default, the linear model is not exact."
         ),
-    ] = SMALL_SLOPE_RAD,
+    ] = SMALL_TIP_SLOPE_RAD,
     amplitude_rad: Annotated[
         float,
         doc(

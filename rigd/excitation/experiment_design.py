@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import Plant
-from rigd.beam.tip import SMALL_SLOPE_RAD
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of, information
 from rigd.excitation._segment_search import (
-    HORIZON_S,
-    SHORTEST_S,
+    PLANNING_HORIZON_S,
+    SHORTEST_SEGMENT_S,
     Segment,
     SegmentSearch,
 )
@@ -72,11 +72,11 @@ class Design:
     """Reference angle of all segments at each tick, shape (n,)."""
     angle_rad: RealArray
     """Predicted angle of the motor at each tick, shape (n,)."""
-    names: tuple[str, ...]
+    parameter_names: tuple[str, ...]
     """Names of the free parameters, in the order of the covariance."""
     covariance: RealArray
     """Covariance of the parameters that is expected at the end of the session, shape (k, k)."""
-    expected: tuple[Precision, ...]
+    expected_precisions: tuple[Precision, ...]
     """Precision of each target that is expected at the end of the session."""
 
 
@@ -87,7 +87,7 @@ def next_segment(
     rig: DesignRig,
     time_left_s: float,
     *,
-    tip_slope_rad: float = SMALL_SLOPE_RAD,
+    tip_slope_rad: float = SMALL_TIP_SLOPE_RAD,
     through: Collection[int] = (),
     limit_fraction: float = 1.0,
 ) -> Segment:
@@ -126,7 +126,7 @@ def next_segment(
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
     move_plant = rig.plant_with(estimate.plant)
     record_so_far = RecordSoFar.from_angle(
-        angle_rad_so_far, estimate, move_plant.rate_hz, HORIZON_S
+        angle_rad_so_far, estimate, move_plant.rate_hz, PLANNING_HORIZON_S
     )
     segment_search = SegmentSearch(
         estimate,
@@ -169,7 +169,7 @@ def geometry_floors(
     targets: Iterable[Target],
     uniformity: float,
     duration_s: float,
-    tip_slope_rad: float = SMALL_SLOPE_RAD,
+    tip_slope_rad: float = SMALL_TIP_SLOPE_RAD,
 ) -> tuple[GeometryFloor, ...]:
     """Return the smallest possible standard deviations of a nearly uniform beam's parameters.
 
@@ -203,7 +203,9 @@ def geometry_floors(
     if not targets or not uniformity:
         return ()
     move_plant = rig.plant_with(estimate.plant)
-    resting_record = RecordSoFar.from_angle(np.zeros(1), estimate, move_plant.rate_hz, SHORTEST_S)
+    resting_record = RecordSoFar.from_angle(
+        np.zeros(1), estimate, move_plant.rate_hz, SHORTEST_SEGMENT_S
+    )
     quantities = Quantities.linearised(targets, estimate)
     segment_search = SegmentSearch(
         estimate, quantities, move_plant, rig.start_rad, resting_record, tip_slope_rad
@@ -256,7 +258,7 @@ def design_excitation(
     duration_s: float,
     *,
     angle_rad_so_far: RealArray | None = None,
-    tip_slope_rad: float = SMALL_SLOPE_RAD,
+    tip_slope_rad: float = SMALL_TIP_SLOPE_RAD,
 ) -> Design:
     """Design segments of excitation until all target precisions are reached or time is over.
 
@@ -293,13 +295,13 @@ def design_excitation(
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> estimate = BeamEstimate(
     ...     plant=Plant(beam, Damping(zeta=7e-5, gamma=0.02)),
-    ...     names=("zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"),
+    ...     free_parameters=("zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"),
     ...     noise_frequency_hz=np.array([1.0]),
     ...     noise_nm2_per_hz=np.array([5e-8]),
     ... )
     >>> rig = RigPreview(load_profile("sim"))
     >>> design = design_excitation(estimate, rig, [parse_target("zeta", "2%")], 20.0)
-    >>> all(each.reached for each in design.expected), design.reference_rad.size < 10_000
+    >>> all(each.reached for each in design.expected_precisions), design.reference_rad.size < 10_000
     (True, True)
     """
     move_plant = rig.plant_with(estimate.plant)
@@ -308,8 +310,10 @@ def design_excitation(
     remaining_s = duration_s
     planned_segments: list[Segment] = []
     while not planned_segments or (
-        remaining_s >= SHORTEST_S
-        and not all(planned_segment.reached for planned_segment in planned_segments[-1].expected)
+        remaining_s >= SHORTEST_SEGMENT_S
+        and not all(
+            planned_segment.reached for planned_segment in planned_segments[-1].expected_precisions
+        )
     ):
         whole_angle_rad = np.concatenate([before_rad, angle_rad])
         new_segment = next_segment(
@@ -324,7 +328,7 @@ def design_excitation(
         segments=tuple(planned_segments),
         reference_rad=reference_rad,
         angle_rad=angle_rad,
-        names=estimate.names,
+        parameter_names=estimate.free_parameters,
         covariance=planned_segments[-1].covariance,
-        expected=planned_segments[-1].expected,
+        expected_precisions=planned_segments[-1].expected_precisions,
     )

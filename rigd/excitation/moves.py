@@ -80,9 +80,12 @@ def vibration_free_path(duration_s: float, rate_hz: float, poles_rad_s: ComplexA
         Path at the n ticks after the start; the last value is 1.
     """
     n = max(1, round(duration_s * rate_hz))
-    for zero_order in (2, 1):
+    for order_of_zeros in (2, 1):
         linear_map = np.concatenate(
-            [_motion_map(n, rate_hz), residual_vibration_map(n, rate_hz, poles_rad_s, zero_order)]
+            [
+                _motion_map(n, rate_hz),
+                residual_vibration_map(n, rate_hz, poles_rad_s, order_of_zeros),
+            ]
         )
         if len(linear_map) > n:
             continue
@@ -188,14 +191,14 @@ def _motion_map(n: int, rate_hz: float) -> RealArray:
 
 
 def residual_vibration_map(
-    n: int, rate_hz: float, poles_rad_s: ComplexArray, zero_order: int
+    n: int, rate_hz: float, poles_rad_s: ComplexArray, order_of_zeros: int
 ) -> RealArray:
     """Return the linear map from n accelerations to the modes' vibration after the last one.
 
     Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
     row for the real part and one for the imaginary part of its complex state at the end of the
-    path. With ``zero_order`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative by
-    the pole as well. The shape is (rows, n).
+    path. With ``order_of_zeros`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative
+    by the pole as well. The shape is (rows, n).
 
     Parameters
     ----------
@@ -205,14 +208,14 @@ def residual_vibration_map(
         Ticks a second.
     poles_rad_s
         Poles of the modes, shape (m,): one pole of each pair.
-    zero_order
+    order_of_zeros
         Order of the zeros: 1 or 2.
     """
     remaining_s = (n - np.arange(n)) / rate_hz
     map_rows: list[RealArray] = []
     for mode_pole in poles_rad_s:
         pole_transform = np.exp(mode_pole * remaining_s) / rate_hz
-        second_order = zero_order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
+        second_order = order_of_zeros > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
         for row in (
             (pole_transform, pole_transform * remaining_s / remaining_s[0])
             if second_order

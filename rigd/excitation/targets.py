@@ -206,7 +206,7 @@ class Quantities:
                 gradients.append(quantity_gradient)
         return cls(
             tuple(quantity_items),
-            np.array(gradients).reshape(len(quantity_items), len(estimate.names)),
+            np.array(gradients).reshape(len(quantity_items), len(estimate.free_parameters)),
         )
 
     def ratios(self, covariance: RealArray) -> RealArray:
@@ -251,7 +251,7 @@ def _linearise(
 
     The third result is the reason why no record can determine the quantity, or an empty text.
     """
-    quantity_gradient = np.zeros(len(estimate.names))
+    quantity_gradient = np.zeros(len(estimate.free_parameters))
     quantity_name = given_target.quantity
     if quantity_name in MODE_QUANTITIES:
         target_mode = next(
@@ -272,12 +272,15 @@ def _linearise(
         if quantity_name == "damping":
             return target_mode.damping_ratio, target_mode.damping_ratio_derivative, ""
         return target_mode.frequency_hz, target_mode.frequency_derivative_hz, ""
-    quantity_value = estimate.values[quantity_name]
+    quantity_value = estimate.parameter_values[quantity_name]
     coefficient_name = COEFFICIENT_OF.get(quantity_name, quantity_name)
-    if estimate.values[coefficient_name] == 0.0 or quantity_name not in estimate.names:
+    if (
+        estimate.parameter_values[coefficient_name] == 0.0
+        or quantity_name not in estimate.free_parameters
+    ):
         impossible_reason = (
             "is absent"
-            if estimate.values[coefficient_name] == 0.0
+            if estimate.parameter_values[coefficient_name] == 0.0
             else f"has {quantity_name} fixed"
         )
         return (
@@ -285,7 +288,7 @@ def _linearise(
             quantity_gradient,
             f"{_DAMPING_KIND[quantity_name]} damping {impossible_reason} in the estimate so far",
         )
-    quantity_gradient[estimate.names.index(quantity_name)] = (
+    quantity_gradient[estimate.free_parameters.index(quantity_name)] = (
         quantity_value if quantity_name in LOGARITHMIC_PARAMETERS else 1.0
     )
     return quantity_value, quantity_gradient, ""

@@ -18,7 +18,14 @@ from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
 from rigd.engine.reference import ReferenceWriter
 from rigd.errors import RigdError
 from rigd.estimates import Estimate
-from rigd.excitation import BAND_HZ, PAUSE_S, SHORTEST_S, BeamEstimate, PrecisionSearch, Segment
+from rigd.excitation import (
+    BAND_HZ,
+    PAUSE_S,
+    SHORTEST_SEGMENT_S,
+    BeamEstimate,
+    PrecisionSearch,
+    Segment,
+)
 from rigd.excitation.experiment_design import expected_precisions, next_segment
 from rigd.excitation.targets import Target
 from rigd.profile import Profile
@@ -170,7 +177,7 @@ def beam_estimate(
         {**fit_document["plant"], "names": parameter_names, "noise": noise_document}
     )
     if uniformity and all(target.quantity in _MODAL_QUANTITY_KEYS for target in targets):
-        return estimated_beam.modal()
+        return estimated_beam.with_modal_parameters()
     # The tolerance is wider if the modes deviate by more than the stated uniformity.
     return estimated_beam.with_tolerance(
         max(uniformity, (fit_document["uniformity_percent"] or 0.0) / 100.0)
@@ -370,7 +377,7 @@ class ExcitationPlanner:
         # Negative if the angle was held for a long time before the last segment.
         remaining_ticks = self._max_ticks - reference_rad.size
         remaining_s = remaining_ticks / self._rate_hz
-        if remaining_s < SHORTEST_S + PAUSE_S:
+        if remaining_s < SHORTEST_SEGMENT_S + PAUSE_S:
             if self.may_be_last or remaining_ticks <= 0:
                 yield self._search_end_message(self._not_reached_text, is_reached=False)
             else:
@@ -390,17 +397,19 @@ class ExcitationPlanner:
         )
         if not self.may_be_last and all(
             target_forecast.ratio <= _SUFFICIENT_STD_RATIO
-            for target_forecast in next_planned_segment.now
+            for target_forecast in next_planned_segment.present_precisions
         ):
             self._append_pause(PAUSE_S)
             return
         impossible_reasons = [
             f"{target_forecast.impossible}."
-            for target_forecast in next_planned_segment.now
+            for target_forecast in next_planned_segment.present_precisions
             if target_forecast.impossible
         ]
         # Two forecasts: from the information of possible segments, and from the progress so far.
-        is_too_slow = next_planned_segment.forecast.seconds > _UNREACHABLE_TIME_RATIO * remaining_s
+        is_too_slow = (
+            next_planned_segment.forecast.time_to_targets_s > _UNREACHABLE_TIME_RATIO * remaining_s
+        )
         unreachable_reason = (
             impossible_reasons[0]
             if impossible_reasons
@@ -590,7 +599,7 @@ class ExcitationPlanner:
                     * target_forecast.target_std
                     / self._tightening,
                 }
-                for target_forecast in segment.expected
+                for target_forecast in segment.expected_precisions
                 if isfinite(target_forecast.std)
             ],
             "share_of_limits": segment.fraction_of_limits,

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from typing import Any, Final
 
 from rigd.beam import Beam
-from rigd.beam.tip import SMALL_SLOPE_RAD, TipMotion, linear_model_error
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD, TipMotion, linear_model_error
 from rigd.errors import UserError
 from rigd.excitation import KINDS, Excitation
 from rigd.profile import Profile
@@ -139,17 +139,17 @@ def tip_in_words(predicted_tip_motion: TipMotion | None, beam: Beam, excitation:
             f"the length), tip speed {predicted_tip_motion.speed_m_s:.3g} m/s, slope "
             f"{predicted_tip_motion.slope_rad:.2g} rad."
         )
-        if not predicted_tip_motion.slope_rad > SMALL_SLOPE_RAD:
+        if not predicted_tip_motion.slope_rad > SMALL_TIP_SLOPE_RAD:
             return motion_text
         motion_text += (
-            f" At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error at "
+            f" At slopes above {SMALL_TIP_SLOPE_RAD:g} rad the linear model is not exact (error at "
             f"most {100 * relative_model_error:.2g} %), and air drag may limit the motion"
         )
     if excitation.kind in KINDS_WITH_TARGET_ANGLE:
         return f"{motion_text}{_STEEP_SLOPE_EFFECTS[excitation.kind]}."
     if excitation.kind not in KINDS:
         return f"{motion_text}; the identification of the motor does not depend on it."
-    amplitude_factor = _rounded_down(SMALL_SLOPE_RAD / predicted_tip_motion.slope_rad)
+    amplitude_factor = _rounded_down(SMALL_TIP_SLOPE_RAD / predicted_tip_motion.slope_rad)
     amplitude_advice = (
         f"; {amplitude_factor:g} times the amplitude stays within" if amplitude_factor > 0 else ""
     )

@@ -19,7 +19,7 @@ from rigd.control import ClosedLoop, ControlDesignError, stable_loop
 from rigd.control.damper import design_damper
 from rigd.engine.messages import PostRecordPlan
 from rigd.errors import UserError
-from rigd.excitation import KINDS, BeamEstimate, Excitation, MovePlant, Value, make_excitation
+from rigd.excitation import KINDS, BeamEstimate, Excitation, MovePlant, OptionValue, make_excitation
 from rigd.identified_beam import BeamUse, read_identified_beam
 from rigd.profile import Profile
 from rigd.runner._move_plant import (
@@ -125,7 +125,7 @@ class RigPreview:
         """Beam estimate with the profile's values and sensor noise, to design excitations."""
         rig = self._profile.rig
         noise_density_nm2_per_hz = 2.0 * torque_noise_nm(self._profile) ** 2 / rig.rate_hz
-        return BeamEstimate.stated(self._profile.plant, noise_density_nm2_per_hz)
+        return BeamEstimate.from_plant(self._profile.plant, noise_density_nm2_per_hz)
 
     @cached_property
     def _closed_loop(self) -> ClosedLoop:
@@ -226,7 +226,7 @@ class RigPreview:
 def excitation_for(
     profile: Profile,
     excitation_kind: str,
-    excitation_parameters: Mapping[str, Value],
+    excitation_parameters: Mapping[str, OptionValue],
     start_angle_rad: float = 0.0,
 ) -> Excitation:
     """Return the excitation with the given kind and parameters for the rig of a profile.

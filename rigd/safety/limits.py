@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 from annotated_types import Ge, Gt, Le, Lt
 
-from rigd.beam.tip import SMALL_SLOPE_RAD
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD
 
 Positive = Annotated[float, Gt(0)]
 """Type of a number above 0."""
@@ -79,7 +79,7 @@ class Limits:
     """Largest percentage of old angles, and of old wrenches, in the ticks scheduled so far.
 
     It is counted as for `missed_percent`. ``analyze`` accepts no record with more than 5 %."""
-    tip_slope_rad: Positive = field(default=SMALL_SLOPE_RAD, metadata={"optional": True})
+    tip_slope_rad: Positive = field(default=SMALL_TIP_SLOPE_RAD, metadata={"optional": True})
     """Largest slope of the antenna's tip that an identification may cause.
 
     The predicted slope is checked before the session. Above the default the linear model is not

@@ -73,11 +73,11 @@ def test_unknown_parameter_is_refused_by_name():
     ],
 )
 def test_a_value_out_of_its_range_is_refused_by_name(name, value):
-    UNIFORM.check()
+    UNIFORM.raise_if_invalid()
     with pytest.raises(ValueError, match=f"{name} = "):
-        UNIFORM.with_parameters({name: value}).check()
+        UNIFORM.with_parameters({name: value}).raise_if_invalid()
     with pytest.raises(ValueError, match="bending_stiffness_n_m2 = 0"):
-        replace(UNIFORM, beam=Beam(0.98, 4.7e-3, 0.0)).check()
+        replace(UNIFORM, beam=Beam(0.98, 4.7e-3, 0.0)).raise_if_invalid()
 
 
 def test_ranges_are_stated_with_their_unit():

@@ -16,7 +16,7 @@ from processes import child_running
 
 from analysis.record import load_record
 from analysis.results import whole_record
-from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD, tip_motion
 from rigd.engine.workers import FIT
 from rigd.profile import load_profile
 from rigd.session import read_session
@@ -198,7 +198,7 @@ def test_free_end_has_small_slopes(search_record):
     profile = load_profile("sim")
     angle_rad = search_record.samples["angle_rad"]
     slope_rad = tip_motion(profile.plant, angle_rad, profile.rig.rate_hz).slope_rad
-    assert 0.5 * SMALL_SLOPE_RAD < slope_rad < SMALL_SLOPE_RAD
+    assert 0.5 * SMALL_TIP_SLOPE_RAD < slope_rad < SMALL_TIP_SLOPE_RAD
 
 
 @pytest.mark.further  # as tests/runner, without processes

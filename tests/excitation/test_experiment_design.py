@@ -56,11 +56,11 @@ def test_loop_of_an_estimate_is_computed_once(rig):
 
 
 def test_all_targets_are_reached_within_the_time(design):
-    assert all(each.reached for each in design.expected)
-    assert not all(each.reached for each in design.segments[0].now)
+    assert all(each.reached for each in design.expected_precisions)
+    assert not all(each.reached for each in design.segments[0].present_precisions)
     assert design.reference_rad.size < 15.0 * RATE_HZ
     assert design.reference_rad.size == design.angle_rad.size
-    assert [each.target.mode for each in design.expected] == [1, 2, 3]
+    assert [each.target.mode for each in design.expected_precisions] == [1, 2, 3]
 
 
 def test_session_stays_within_limits_and_small_slopes(rig):
@@ -121,27 +121,27 @@ def test_segment_fits_in_the_remaining_time(rig, scanned):
 
 def test_unreachable_target_is_reported_with_the_reason(rig, scanned, design):
     hard = next_segment(ESTIMATE, scanned, [parse_target("damping", "0.01%")], rig, 60.0).forecast
-    assert hard.seconds > 1000
+    assert hard.time_to_targets_s > 1000
     assert "60 s are left" in hard.reason
     easy = design.segments[0].forecast
-    assert 0 < easy.seconds < 20
+    assert 0 < easy.time_to_targets_s < 20
     assert not easy.reason
     internal = replace(
         ESTIMATE,
         plant=replace(ESTIMATE.plant, damping=Damping(zeta=7.1e-5)),
-        names=tuple(name for name in UNIFORM if name not in ("gamma", "lambda")),
+        free_parameters=tuple(name for name in UNIFORM if name not in ("gamma", "lambda")),
     )
     absent = next_segment(internal, scanned, [parse_target("gamma", "5%")], rig, 60.0)
-    assert absent.forecast.seconds == np.inf
+    assert absent.forecast.time_to_targets_s == np.inf
     assert "external damping is absent" in absent.forecast.reason
-    assert not any(each.reached for each in absent.expected)
+    assert not any(each.reached for each in absent.expected_precisions)
     beyond = next_segment(ESTIMATE, scanned, [parse_target("damping", "7:1%")], rig, 60.0)
     assert "mode 7 is not below 50 Hz" in beyond.forecast.reason
 
 
 def test_predicted_duration_is_near_that_of_a_design(design):
     taken_s = design.reference_rad.size / RATE_HZ
-    assert 0.4 < design.segments[0].forecast.seconds / taken_s < 2.5
+    assert 0.4 < design.segments[0].forecast.time_to_targets_s / taken_s < 2.5
 
 
 def test_only_the_requested_mode_is_driven(rig):

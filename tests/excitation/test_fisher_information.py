@@ -36,7 +36,7 @@ def moved(angle, estimate):
 
 def stepped(estimate, name, step):
     """Estimate with one parameter changed; by a factor where its logarithm counts."""
-    value = estimate.values[name]
+    value = estimate.parameter_values[name]
     value = value * np.exp(step) if name in LOGARITHMIC_PARAMETERS else value + step
     return replace(estimate, plant=estimate.plant.with_parameters({name: value}))
 
@@ -75,7 +75,7 @@ def test_information_is_the_gram_matrix_of_differences():
 
 def test_information_of_a_sine_on_stiffness_in_closed_form():
     """Far from the modes: half the squared amplitude over the noise's density, per second."""
-    alone = replace(ESTIMATE, names=("bending_stiffness_n_m2",))
+    alone = replace(ESTIMATE, free_parameters=("bending_stiffness_n_m2",))
     alone = replace(alone, plant=replace(alone.plant, delay_s=0.0))
     t = np.arange(30_000) / RATE_HZ
     ramp = np.minimum(1.0, t / 5.0)
@@ -127,7 +127,7 @@ DOCUMENT = {
 def test_an_estimate_is_read_from_json():
     estimate = BeamEstimate.from_dict(json.loads(json.dumps(DOCUMENT)))
     assert estimate.plant.beam == Beam(0.98, 4.7e-3, 0.09)
-    assert estimate.names == ("zeta", "alpha", "density_over_stiffness")
+    assert estimate.free_parameters == ("zeta", "alpha", "density_over_stiffness")
     assert estimate.plant.delay_s == 1e-3
     assert len(estimate.modes()) == 3
 

@@ -10,7 +10,7 @@ from cases import further
 
 from rigd import excitation
 from rigd.beam import GRADIENT_NAMES, Beam, transfer_and_gradient
-from rigd.beam.tip import SMALL_SLOPE_RAD
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD
 from rigd.excitation import KINDS, ExcitationError, make_excitation
 from rigd.excitation._narrow_sweeps import Band, FoundMode, first_order_damping, time_fractions
 from rigd.runner import with_tip_slope
@@ -135,7 +135,7 @@ def test_amplitudes_stay_within_the_tip_slope(document, profile, limit_rad):
     options = {"path": document(), "duration_s": 24.0}
     made = excitation_for(rig, "modes", options)
     plan = plan_session(rig, made)
-    limit_rad = limit_rad or SMALL_SLOPE_RAD
+    limit_rad = limit_rad or SMALL_TIP_SLOPE_RAD
     assert made.parameters["tip_slope_rad"] == limit_rad
     assert 0.8 * limit_rad < plan.prediction.tip.slope_rad <= 0.91 * limit_rad
 
@@ -210,7 +210,7 @@ def test_equal_documents_give_equal_references(make, made):
 
 def test_metadata_have_units_and_plain_values(made):
     assert made.kind == "modes"
-    assert made.parameters["tip_slope_rad"] == SMALL_SLOPE_RAD
+    assert made.parameters["tip_slope_rad"] == SMALL_TIP_SLOPE_RAD
     assert made.parameters["file"] == "fits.json"
     assert json.loads(json.dumps(dict(made.parameters))) == made.parameters
     numbers = {name for name, value in made.parameters.items() if isinstance(value, float)}

@@ -135,7 +135,7 @@ def test_robust_move_tolerates_frequency_errors(plant, plain, profile, ring_down
 def test_move_removes_initial_vibration(plant, ring_down_nm, robust):
     before = 0.1 * quintic(0.15, RATE_HZ)
     ringing = modal_state(np.concatenate([[0.0], before]), RATE_HZ, plant.poles_rad_s)
-    move = shortest_move(plant, 0.5, robust=robust, ringing=ringing)
+    move = shortest_move(plant, 0.5, robust=robust, initial_modal_states=ringing)
     blind = shortest_move(plant, 0.5, robust=robust)
     left, not_taken_out = (
         vibration_nm(ring_down_nm(np.concatenate([before, before[-1] + each.reference_rad])))

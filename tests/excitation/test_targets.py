@@ -64,7 +64,7 @@ def test_invalid_text_is_refused_with_a_remedy(quantity, text, message):
 )
 def test_derivatives_of_modes_match_the_model(name, step):
     """Derivatives of damping ratio and frequency, against differences of the model's own modes."""
-    index, value = UNIFORM.index(name), ESTIMATE.values[name]
+    index, value = UNIFORM.index(name), ESTIMATE.parameter_values[name]
 
     def moved(by):
         moved_value = value * (1 + by) if name in LOGARITHMIC_PARAMETERS else value + by
@@ -95,7 +95,7 @@ def test_relative_target_of_zero_is_impossible():
     none = replace(
         ESTIMATE,
         plant=replace(ESTIMATE.plant, damping=Damping()),
-        names=("density_over_stiffness",),
+        free_parameters=("density_over_stiffness",),
     )
     found = Quantities.linearised(
         [parse_target("damping", "1%"), parse_target("alpha", "0.1")], none

@@ -14,7 +14,7 @@ ESTIMATE = BeamEstimate(
         Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275),
         Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
     ),
-    names=UNIFORM,
+    free_parameters=UNIFORM,
     noise_frequency_hz=np.array([1.0]),
     noise_nm2_per_hz=np.array([5e-8]),
 )

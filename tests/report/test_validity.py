@@ -10,7 +10,7 @@ import pytest
 
 from analysis.report import document, document_text, result_text, summary_table
 from analysis.results import RecordResult
-from rigd.beam.tip import SMALL_SLOPE_RAD, linear_model_error
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD, linear_model_error
 from rigd.session import Validity
 
 pytestmark = pytest.mark.fit
@@ -38,7 +38,7 @@ def outputs(result, as_text):
 
 def test_every_output_with_a_damping_has_its_validity(record_result, report, as_text):
     validity = record_result.validity
-    assert validity.predicted_peak_tip_slope_rad > 2 * SMALL_SLOPE_RAD
+    assert validity.predicted_peak_tip_slope_rad > 2 * SMALL_TIP_SLOPE_RAD
     alone = {
         f"{n}, Welch alone": t
         for n, t in outputs(replace(record_result, whole=None), as_text).items()

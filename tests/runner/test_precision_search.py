@@ -72,10 +72,18 @@ def use_rest_segments(monkeypatch, std):
 
     def design(estimate, angle_rad, targets, rig, time_left_s, **options):
         planned.append({"targets": targets, **options})
-        k = len(estimate.names)
+        k = len(estimate.free_parameters)
         now = (Precision(targets[0], 1.0, std, 0.1),)
         return Segment(
-            "rest", rest, rest, estimate.names, np.eye(k), now, now, PrecisionForecast(1e4, ""), 0
+            "rest",
+            rest,
+            rest,
+            estimate.free_parameters,
+            np.eye(k),
+            now,
+            now,
+            PrecisionForecast(1e4, ""),
+            0,
         )
 
     monkeypatch.setattr("rigd.runner._precision_search.next_segment", design)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import further
 
-from rigd.beam.tip import SMALL_SLOPE_RAD, linear_model_error
+from rigd.beam.tip import SMALL_TIP_SLOPE_RAD, linear_model_error
 from rigd.errors import UserError
 from rigd.excitation import chirp, from_csv, multisine, step
 from rigd.identification.experiments import speeds_session
@@ -36,7 +36,7 @@ def test_identification_beyond_the_limit_is_refused_with_remedies(profile, kind)
     ).refusal_text  # no torque is concerned
     (line,) = [each for each in refused.splitlines() if "tip slope" in each]
     slope_rad, limit_rad = map(float, re.search(r"of (\S+) rad exceeds (\S+) rad", line).groups())
-    assert slope_rad > limit_rad == SMALL_SLOPE_RAD
+    assert slope_rad > limit_rad == SMALL_TIP_SLOPE_RAD
     assert "(limits.tip_slope_rad)" in line
     lower_rad = float(re.search(r"lower the amplitude to (\S+) rad", line)[1])
     assert lower_rad == largest_amplitude(profile, excitation, allows_saturation=True)
@@ -58,7 +58,7 @@ def test_chirp_is_exempt_up_to_the_reference_amplitude(profile):
         assert "error at most 12 %" in plan.tip_in_words
     # The offered amplitude is within the range of the linear model.
     offered = chirp(rate_hz=1000.0, amplitude_rad=largest_amplitude(profile, excitation))
-    assert predict_session(profile, offered).prediction.tip.slope_rad <= SMALL_SLOPE_RAD
+    assert predict_session(profile, offered).prediction.tip.slope_rad <= SMALL_TIP_SLOPE_RAD
 
 
 def test_file_beyond_the_limit_is_refused_with_a_factor(profile, tmp_path):
@@ -79,7 +79,7 @@ def test_file_beyond_the_limit_is_refused_with_a_factor(profile, tmp_path):
 )
 def test_moves_and_touches_state_their_slope(profile, kind, options, meaning):
     plan = predict_session(profile, excitation_for(profile, kind, options))
-    assert plan.prediction.tip.slope_rad > SMALL_SLOPE_RAD
+    assert plan.prediction.tip.slope_rad > SMALL_TIP_SLOPE_RAD
     assert "slope" not in plan.refusal_text
     assert f"slope {plan.prediction.tip.slope_rad:.2g} rad" in plan.tip_in_words
     assert meaning in plan.tip_in_words
@@ -90,7 +90,7 @@ def test_moves_and_touches_state_their_slope(profile, kind, options, meaning):
 def test_motor_identification_is_independent_of_the_model(profile):
     excitation = speeds_session(profile, torque_percent=40.0, stroke_rad=0.8)
     plan = predict_session(profile, excitation)
-    assert plan.prediction.tip.slope_rad > SMALL_SLOPE_RAD
+    assert plan.prediction.tip.slope_rad > SMALL_TIP_SLOPE_RAD
     assert not plan.refusal_text
     assert "does not depend on it" in plan.tip_in_words
     assert "amplitude" not in plan.tip_in_words
@@ -106,7 +106,7 @@ def test_impossible_deflection_is_not_stated(profile):
     assert " m " not in plan.tip_in_words
     small = plan_document(profile, MAKE["step"](0.01), predict_session(profile, MAKE["step"](0.01)))
     assert small["tip"]["physical"]
-    assert small["limits"]["tip_slope_rad"] == SMALL_SLOPE_RAD
+    assert small["limits"]["tip_slope_rad"] == SMALL_TIP_SLOPE_RAD
 
 
 def test_file_has_the_predicted_slope(profile):
@@ -114,7 +114,7 @@ def test_file_has_the_predicted_slope(profile):
     plan = predict_session(profile, excitation)
     metadata = predicted_metadata(profile, plan.prediction, excitation)
     assert float(metadata["predicted_peak_tip_slope_rad"]) == plan.prediction.tip.slope_rad
-    assert float(metadata["limit_tip_slope_rad"]) == SMALL_SLOPE_RAD
+    assert float(metadata["limit_tip_slope_rad"]) == SMALL_TIP_SLOPE_RAD
     # Segments planned during the session may reach the limit; the scan does not.
     rig = with_tip_slope(profile, 0.2)
     search = excitation_for(rig, "until", {"targets": "damping 1%"})
