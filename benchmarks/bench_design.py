@@ -66,7 +66,7 @@ CHIRP_S = 136.0
 def precisions(angle_rad: Real, targets: list[Target]) -> tuple[Precision, ...]:
     """Return the precisions expected after a record."""
     covariance = covariance_of(information(angle_rad, ESTIMATE, RATE_HZ), ESTIMATE)
-    return Quantities.linearised(targets, ESTIMATE).precisions(covariance)
+    return Quantities.from_targets(targets, ESTIMATE).precisions(covariance)
 
 
 def designed(
@@ -99,7 +99,7 @@ def steady_s(rig: RigPreview, targets: list[Target], tip_slope_rad: float) -> fl
     """Return the time of the best steady sines alone, a lower bound for any session, in s."""
     record = RecordSoFar.from_angle(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
     plant = rig.plant_with(Plant(LINK, DAMPING))
-    quantities = Quantities.linearised(targets, ESTIMATE)
+    quantities = Quantities.from_targets(targets, ESTIMATE)
     return float(
         SegmentSearch(ESTIMATE, quantities, plant, 0.0, record, tip_slope_rad).mixture.times_s.sum()
     )
@@ -226,7 +226,7 @@ def check(rig: RigPreview, sessions: int, slope_rad: float) -> None:
     targets = [parse_target("damping", "1%")]
     reference, angle, _, _ = designed(rig, targets, 30.0, slope_rad)
     names = ("zeta", "alpha", "gamma", "lambda")
-    requested = [*(Target(name, 1.0, relative=False) for name in names), *targets]
+    requested = [*(Target(name, 1.0, is_relative=False) for name in names), *targets]
     predicted = [each.std for each in precisions(angle, requested)]
     made = response(Plant(LINK, DAMPING), reference)
     everywhere = np.ones(made.angle_rad.size, dtype=bool)

@@ -19,7 +19,7 @@ from timing import least_in_turn_s
 from rigd.control import PidController, design_pid
 from rigd.excitation import chirp
 from rigd.excitation.moves import slew, vibration_free_path
-from rigd.identified_beam import TOUCH
+from rigd.identified_beam import TOUCH_USE
 from rigd.profile import Profile, load_profile
 from rigd.runner.planning import RigPreview
 from rigd.sim import SimulatedRig
@@ -99,7 +99,7 @@ def with_rig(profile: Profile, **changes: object) -> Profile:
 def detection(touches: int, gate: Gate) -> None:
     """Slew into obstacles of random position and stiffness at random speed."""
     profile = load_profile("sim")
-    poles = RigPreview(profile).move_plant("", TOUCH).poles_rad_s
+    poles = RigPreview(profile).move_plant("", TOUCH_USE).poles_rad_s
     random = np.random.default_rng(1)
     delays, peaks, missed = [], [], 0
     for number in range(touches):
@@ -151,7 +151,7 @@ def detection(touches: int, gate: Gate) -> None:
 def free_motion(hours: float, gate: Gate) -> None:
     """Slew, move and sweep without obstacles, and count detections."""
     profile = load_profile("sim")
-    poles = RigPreview(profile).move_plant("", TOUCH).poles_rad_s
+    poles = RigPreview(profile).move_plant("", TOUCH_USE).poles_rad_s
     random = np.random.default_rng(2)
     false = ticks = 0
     number = 0

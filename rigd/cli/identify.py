@@ -207,4 +207,6 @@ def _estimate_motor(files: list[Path], profile_name: str) -> "tuple[MotorEstimat
         motor_recording.timing,
         tool_inertia_kg_m2=motor_recording.tool_inertia_kg_m2,
     )
-    return motor_estimate, propose(motor_estimate, profile, unusable_count=motor_recording.unusable)
+    return motor_estimate, propose(
+        motor_estimate, profile, unusable_count=motor_recording.unusable_pass_count
+    )

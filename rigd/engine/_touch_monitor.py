@@ -51,7 +51,7 @@ class TouchMonitor:
         self._detector = TouchDetector(order.beam, rate_hz, order.settings)
         self._passes = iter(order.approach.passes)
         self._pass = next(self._passes)
-        self._arming_tick = self._pass.begins
+        self._arming_tick = self._pass.begin_tick
         self._excessive_force_ticks = 0
 
     def step(self, tick: int, missed_ticks: int) -> DetectedContact | None:
@@ -67,9 +67,9 @@ class TouchMonitor:
             px, py, pz, qx, qy, qz = self._projection
             fx, fy, fz, tx, ty, tz = cycle.wrench
             shear_n = px * fx + py * fy + pz * fz + qx * tx + qy * ty + qz * tz
-        while tick >= self._pass.ends and (next_pass := next(self._passes, None)) is not None:
+        while tick >= self._pass.end_tick and (next_pass := next(self._passes, None)) is not None:
             self._pass = next_pass
-            self._arming_tick = next_pass.begins
+            self._arming_tick = next_pass.begin_tick
         if self._arming_tick <= tick:
             self._arming_tick = len(self._reference_rad)
             detector.arm()
@@ -85,7 +85,7 @@ class TouchMonitor:
         if forceful_contact is not None or not is_touched:
             return forceful_contact
         cycle.flags |= _TOUCHED
-        if tick >= self._pass.returns:
+        if tick >= self._pass.return_tick:
             return DetectedContact(
                 "The beam met something on its way back. Find what is in its way.", "stopped"
             )
@@ -101,11 +101,13 @@ class TouchMonitor:
             reference_rad[max(tick - 1, 0)],
             reference_rad[tick],
         )
-        start_angle_rad = reference_rad[current_pass.begins - 1] if current_pass.begins else 0.0
-        path_rad = reference_after_touch(
-            self._approach, current_pass.ends, tick, last_angles_rad, start_angle_rad
+        start_angle_rad = (
+            reference_rad[current_pass.begin_tick - 1] if current_pass.begin_tick else 0.0
         )
-        reference_rad[tick + 1 : current_pass.ends] = memoryview(path_rad)  # type: ignore[arg-type] # numpy's stubs
+        path_rad = reference_after_touch(
+            self._approach, current_pass.end_tick, tick, last_angles_rad, start_angle_rad
+        )
+        reference_rad[tick + 1 : current_pass.end_tick] = memoryview(path_rad)  # type: ignore[arg-type] # numpy's stubs
 
     def _check_force_limit(self, shear_n: float) -> DetectedContact | None:
         """Return a contact if its force exceeded the limit in two consecutive ticks, else None."""

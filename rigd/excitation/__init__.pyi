@@ -30,7 +30,7 @@ from ._touch_passes import TouchExcitation as TouchExcitation
 from ._touch_passes import TouchPass as TouchPass
 from ._touch_passes import reference_after_touch as reference_after_touch
 from ._touch_passes import touch as touch
-from ._until import PAUSE_S as PAUSE_S
+from ._until import SEGMENT_PAUSE_S as SEGMENT_PAUSE_S
 from ._until import PrecisionExcitation as PrecisionExcitation
 from ._until import PrecisionSearch as PrecisionSearch
 from ._until import until as until

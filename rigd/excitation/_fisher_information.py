@@ -70,7 +70,7 @@ class TorqueModel:
     """Parameters of the model."""
     rate_hz: float
     """Rate of the angle in ticks a second."""
-    ticks: int
+    tick_count: int
     """Length of the records in ticks, a multiple of `ticks_per_model_sample`."""
     ticks_per_model_sample: int
     """Number of ticks from one sample of the model to the next."""
@@ -112,7 +112,7 @@ class TorqueModel:
     def spectrum(self, angle_rad: RealArray) -> ComplexArray:
         """Return the Laplace transform of a motor angle at the frequencies of the band.
 
-        The angle in rad begins at rest and has the shape (n,), with n at most `ticks`.
+        The angle in rad begins at rest and has the shape (n,), with n at most `tick_count`.
         """
         return self.transform.forward(angle_rad, oversampling=self.ticks_per_model_sample)
 
@@ -122,7 +122,8 @@ class TorqueModel:
         `angle_transform` is the transform of the angle. The shape is (k, samples).
         """
         return self.transform.inverse(
-            self.derivative_kernels * angle_transform, self.ticks // self.ticks_per_model_sample
+            self.derivative_kernels * angle_transform,
+            self.tick_count // self.ticks_per_model_sample,
         )
 
     def torque_and_slope(self, angle_transform: ComplexArray) -> RealArray:
@@ -132,7 +133,7 @@ class TorqueModel:
         """
         return self.transform.inverse(
             self.channel_responses * angle_transform,
-            self.ticks,
+            self.tick_count,
             oversampling=self.ticks_per_model_sample,
         )
 

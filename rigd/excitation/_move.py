@@ -17,7 +17,7 @@ from rigd.excitation._signals import (
     require_finite,
     require_within_turn,
 )
-from rigd.identified_beam import MOVE, BeamUse
+from rigd.identified_beam import MOVE_USE, BeamUse
 
 _MAX_END_ANGLE_FRACTION: Final = 0.98
 """Largest fraction of the angle limit at which a move may end; the remainder is for overshoot."""
@@ -87,7 +87,7 @@ def move(
     start_rad = rig.start_rad
     target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
     require_within_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
-    rig_plant = rig.move_plant(path, MOVE)
+    rig_plant = rig.move_plant(path, MOVE_USE)
     farthest_allowed_rad = _MAX_END_ANGLE_FRACTION * rig_plant.angle_rad
     if not abs(target_rad) <= farthest_allowed_rad:
         raise ExcitationError(

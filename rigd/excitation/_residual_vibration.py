@@ -7,7 +7,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation.moves import ROBUST_BELOW_HZ
+from rigd.excitation.moves import MAX_ROBUST_MODE_HZ
 
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complexfloating]
@@ -57,7 +57,7 @@ class MoveEnd:
     """Predicted arrival time and residual vibration of a move.
 
     The vibration is the root of the sum of squares of the amplitudes of the modes below
-    `ROBUST_BELOW_HZ`, in the coupling torque, at the end of the reference. The modes above have
+    `MAX_ROBUST_MODE_HZ`, in the coupling torque, at the end of the reference. The modes above have
     decayed when the motor has arrived.
     """
 
@@ -78,7 +78,7 @@ def predict_move_end(rig: DisturbedRig, reference_rad: RealArray, ring_down_s: f
     The reference is relative to the start angle, at the ticks after the start.
     """
     rate_hz, end_tick = rig.rate_hz, reference_rad.size
-    ringing_poles = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]
+    ringing_poles = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * MAX_ROBUST_MODE_HZ]
     if not ringing_poles.size:
         ringing_poles = rig.poles_rad_s[:1]
     decay_per_s = -ringing_poles.real

@@ -17,13 +17,13 @@ from rigd.excitation._fisher_information import RecordSoFar, TorqueModel, covari
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import MAX_PLANNED_LIMIT_FRACTION, ExcitationError
 from rigd.excitation._sine_mixture import (
-    UNREACHABLE_S,
+    UNREACHABLE_TIME_S,
     best_mixture,
     steady_sines,
     time_with_ring_up,
 )
 from rigd.excitation._sweeps import (
-    FADE_S,
+    SWEEP_FADE_S,
     ContinuedDrive,
     SegmentCandidate,
     SweepBand,
@@ -167,7 +167,7 @@ class SegmentSearch:
         # With too little time all targets are missed by one factor, not the last mode alone.
         relaxation, mixture_duration_s = 1.0, self.mixture_duration_s
         for _ in range(_MAX_TARGET_RELAXATIONS):
-            if not time_left_s < mixture_duration_s < UNREACHABLE_S:
+            if not time_left_s < mixture_duration_s < UNREACHABLE_TIME_S:
                 break
             relaxation *= (mixture_duration_s / time_left_s) ** 0.5
             self.mixture = best_mixture(
@@ -202,7 +202,7 @@ class SegmentSearch:
             )
         return max(
             (self.best_of_duration(d, mode_numbers) for d in durations_s),
-            key=lambda candidate: candidate.information_s,
+            key=lambda candidate: candidate.information_time_s,
         )
 
     def best_of_duration(
@@ -230,13 +230,13 @@ class SegmentSearch:
         mode_sweeps = {
             sweep_band.mode_number: sweep_pair
             for sweep_band, sweep_pair in reversed(sweep_pairs)
-            if sweep_band.at_mode
+            if sweep_band.is_at_mode
         }
         # A single line does not show a mode: any smooth response could produce it.
         resonance_bands = {
             sweep_band.mode_number: sweep_band
             for sweep_band, _ in sweep_pairs
-            if sweep_band.at_mode and sweep_band.mode_number in mode_numbers
+            if sweep_band.is_at_mode and sweep_band.mode_number in mode_numbers
         }
         start_candidate_by_mode = {
             mode_number: self.with_modes_at_rest(empty_candidate, mode_number, mode_sweeps)
@@ -246,7 +246,7 @@ class SegmentSearch:
             (
                 self.with_band(start_candidate, 1.0, sweep_band, sweep_pair, phase_index)
                 for sweep_band, sweep_pair in sweep_pairs
-                if sweep_band.at_mode
+                if sweep_band.is_at_mode
                 and (not mode_numbers or sweep_band is resonance_bands.get(sweep_band.mode_number))
                 for start_candidate in (
                     empty_candidate,
@@ -254,10 +254,12 @@ class SegmentSearch:
                 )
                 for phase_index in range(_PHASE_COUNT)
             ),
-            key=lambda candidate: candidate.information_s,
+            key=lambda candidate: candidate.information_time_s,
         )
         for _ in range(2):
-            driven_modes = {sweep_band.mode_number for sweep_band, _ in leading_candidate.parts}
+            driven_modes = {
+                sweep_band.mode_number for sweep_band, _ in leading_candidate.bands_and_amplitudes
+            }
             extended_candidates = [
                 self.with_band(
                     leading_candidate, amplitude_fraction, sweep_band, sweep_pair, phase_index
@@ -269,10 +271,10 @@ class SegmentSearch:
             ]
             better_candidate = max(
                 extended_candidates,
-                key=lambda candidate: candidate.information_s,
+                key=lambda candidate: candidate.information_time_s,
                 default=leading_candidate,
             )
-            if better_candidate.information_s <= leading_candidate.information_s:
+            if better_candidate.information_time_s <= leading_candidate.information_time_s:
                 break
             leading_candidate = better_candidate
         return leading_candidate
@@ -307,15 +309,17 @@ class SegmentSearch:
         tail_slice = slice(first_sample, first_sample + self.to_model_samples(_MODE_OBSERVATION_S))
         # One second of the tip's slope suffices to separate the modes.
         tip_slopes = np.stack(
-            [other_sweep.slope[tail_slice] for other_sweep in other_sweeps], axis=1
+            [other_sweep.tip_slope[tail_slice] for other_sweep in other_sweeps], axis=1
         )
         present_slope = self.tip_slope[tail_slice]
         sweep_factors = -np.linalg.lstsq(tip_slopes, present_slope)[0]
         summed_channels = sum(
-            f * other_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
+            f * other_sweep.limit_fractions[:, ::_LIMIT_CHECK_TICKS]
             for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
         )
-        amplitude_fraction = min(1.0, largest_factor(start_candidate.channels, summed_channels))
+        amplitude_fraction = min(
+            1.0, largest_factor(start_candidate.limit_fractions, summed_channels)
+        )
         summed_weighted_rows = sum(
             f * other_sweep.weighted_rows
             for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
@@ -327,12 +331,12 @@ class SegmentSearch:
                 (amplitude_fraction * f, other_sweep)
                 for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
             ),
-            start_candidate.channels + amplitude_fraction * summed_channels,
+            start_candidate.limit_fractions + amplitude_fraction * summed_channels,
             start_candidate.weighted_rows + amplitude_fraction * summed_weighted_rows,
             start_candidate.tip_slope
             + amplitude_fraction
             * sum(
-                f * other_sweep.slope
+                f * other_sweep.tip_slope
                 for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
             ),
             0.0,
@@ -381,11 +385,11 @@ class SegmentSearch:
         return UnitSweep(
             reference_rad=reference_rad,
             angle_rad=loop_response.angle_rad[:n],
-            rows=whitened_rows,
+            torque_derivatives=whitened_rows,
             weighted_rows=self.mixture.weights @ whitened_rows,
-            slope=slope_rad[:: self.model.ticks_per_model_sample][: self.sample_count]
+            tip_slope=slope_rad[:: self.model.ticks_per_model_sample][: self.sample_count]
             / self.limits[-1],
-            channels=limit_channels / self.limits[:, None],
+            limit_fractions=limit_channels / self.limits[:, None],
         )
 
     def with_band(
@@ -405,21 +409,21 @@ class SegmentSearch:
         sine_factor, cosine_factor = float(np.cos(phase_rad)), float(np.sin(phase_rad))
         first_sweep, second_sweep = sweep_pair
         ringing_channels = self.ringing_fractions[
-            :, : first_sweep.channels.shape[1] : _LIMIT_CHECK_TICKS
+            :, : first_sweep.limit_fractions.shape[1] : _LIMIT_CHECK_TICKS
         ]
         unit_channels = (
-            sine_factor * first_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
-            + cosine_factor * second_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
+            sine_factor * first_sweep.limit_fractions[:, ::_LIMIT_CHECK_TICKS]
+            + cosine_factor * second_sweep.limit_fractions[:, ::_LIMIT_CHECK_TICKS]
         )
         base_channels = ringing_channels + amplitude_fraction * (
-            base_candidate.channels - ringing_channels
+            base_candidate.limit_fractions - ringing_channels
         )
         amplitude_rad = largest_factor(base_channels, unit_channels)
         tip_slope_fractions = self.tip_slope + amplitude_fraction * (
             base_candidate.tip_slope - self.tip_slope
         )
         tip_slope_fractions += amplitude_rad * (
-            sine_factor * first_sweep.slope + cosine_factor * second_sweep.slope
+            sine_factor * first_sweep.tip_slope + cosine_factor * second_sweep.tip_slope
         )
         weighted_rows = self.rows_if_held + amplitude_fraction * (
             base_candidate.weighted_rows - self.rows_if_held
@@ -427,7 +431,11 @@ class SegmentSearch:
         weighted_rows += amplitude_rad * (
             sine_factor * first_sweep.weighted_rows + cosine_factor * second_sweep.weighted_rows
         )
-        leading_band = base_candidate.parts[0][0] if base_candidate.parts else sweep_band
+        leading_band = (
+            base_candidate.bands_and_amplitudes[0][0]
+            if base_candidate.bands_and_amplitudes
+            else sweep_band
+        )
         information_value = self.information_to_horizon(
             leading_band, weighted_rows, tip_slope_fractions, base_candidate.duration_s
         )
@@ -436,14 +444,14 @@ class SegmentSearch:
             (
                 *(
                     (base_part, amplitude_fraction * part_amplitude)
-                    for base_part, part_amplitude in base_candidate.parts
+                    for base_part, part_amplitude in base_candidate.bands_and_amplitudes
                 ),
                 (sweep_band, amplitude_rad),
             ),
             (
                 *(
                     (amplitude_fraction * sweep_factor, base_sweep)
-                    for sweep_factor, base_sweep in base_candidate.terms
+                    for sweep_factor, base_sweep in base_candidate.amplitudes_and_sweeps
                 ),
                 (amplitude_rad * sine_factor, first_sweep),
                 (amplitude_rad * cosine_factor, second_sweep),
@@ -509,17 +517,19 @@ class SegmentSearch:
             driven_mode = next(
                 beam_mode for beam_mode in self.modes if beam_mode.mode == sweep_band.mode_number
             )
-            end_sample = self.to_model_samples(duration_s - FADE_S)
+            end_sample = self.to_model_samples(duration_s - SWEEP_FADE_S)
             tail_slice = slice(end_sample - self.to_model_samples(_MODE_OBSERVATION_S), end_sample)
             time_s = np.arange(tail_slice.start, tail_slice.stop) / self.model.sample_hz
             # Fraction of the steady amplitude that the mode has reached by then.
-            ring_up_fraction = 1.0 - np.exp(driven_mode.at_rad_s.real * (time_s - 0.5 * FADE_S))
+            ring_up_fraction = 1.0 - np.exp(
+                driven_mode.at_rad_s.real * (time_s - 0.5 * SWEEP_FADE_S)
+            )
             oscillation = np.exp(1j * driven_mode.at_rad_s.imag * time_s)
             oscillation_columns = (
                 np.stack([oscillation.real, -oscillation.imag], axis=1) * ring_up_fraction[:, None]
             )
             tip_slopes = np.stack(
-                [sine_sweep.slope[tail_slice] for sine_sweep in sine_pair], axis=1
+                [sine_sweep.tip_slope[tail_slice] for sine_sweep in sine_pair], axis=1
             )
             drive_per_amplitude = np.linalg.inv(np.linalg.lstsq(oscillation_columns, tip_slopes)[0])
             self._continued_drives[sweep_band.middle_hz] = ContinuedDrive(
@@ -531,14 +541,15 @@ class SegmentSearch:
         """Return a candidate as a segment, with the standard deviations expected after it."""
         estimate, quantities = self.estimate, self.quantities
         segment_samples = self.to_model_samples(chosen_candidate.duration_s)
-        segment_channels = chosen_candidate.weighted_sum("channels")
+        segment_channels = chosen_candidate.weighted_sum("limit_fractions")
         ringing_channels = self.ringing_fractions[:, : segment_channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
         amplitude_fraction = min(1.0, largest_factor(ringing_channels, segment_channels))
         present_covariance = covariance_of(self.record.information_after(None, 0), estimate)
         later_covariance = covariance_of(
             self.record.information_after(
-                amplitude_fraction * chosen_candidate.weighted_sum("rows"), segment_samples
+                amplitude_fraction * chosen_candidate.weighted_sum("torque_derivatives"),
+                segment_samples,
             ),
             estimate,
         )
@@ -564,12 +575,14 @@ class SegmentSearch:
     def forecast(self, time_left_s: float) -> PrecisionForecast:
         """Return the forecast of the time in s until all target standard deviations are reached."""
         impossible_reasons = [
-            precision.impossible for precision in self.quantities.items if precision.impossible
+            precision.impossible_reason
+            for precision in self.quantities.quantity_precisions
+            if precision.impossible_reason
         ]
         if impossible_reasons:
             return PrecisionForecast(inf, impossible_reasons[0])
         forecast_s = self.mixture_duration_s
-        if not forecast_s < UNREACHABLE_S:
+        if not forecast_s < UNREACHABLE_TIME_S:
             return PrecisionForecast(inf, "the motor cannot excite the modes that determine it")
         if forecast_s <= time_left_s:
             return PrecisionForecast(forecast_s, "")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rigd.excitation._signals import MAX_PLANNED_LIMIT_FRACTION, ExcitationError
 from rigd.excitation.moves import (
-    ROBUST_BELOW_HZ,
+    MAX_ROBUST_MODE_HZ,
     Braking,
     braked_reference,
     braking_path,
@@ -153,7 +153,7 @@ def shortest_move(
     start_rad
         Start angle from the rig's zero.
     robust
-        Whether the move has zeros of second order for the modes below `ROBUST_BELOW_HZ`, to
+        Whether the move has zeros of second order for the modes below `MAX_ROBUST_MODE_HZ`, to
         tolerate a 1 % frequency error, and does not turn back. It then takes longer.
     initial_modal_states
         Complex state of the modes at the start as `modal_state` returns it, shape (m,), which the
@@ -374,7 +374,7 @@ class _MoveSearch:
             end_state = mode_state * np.exp(mode_pole * move_ticks / self._plant.rate_hz)
             # The row of the derivative weighs the start by 1.
             has_second_order_zero = (
-                self._order_of_zeros > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
+                self._order_of_zeros > 1 and abs(mode_pole) < 2 * np.pi * MAX_ROBUST_MODE_HZ
             )
             for _ in range(2 if has_second_order_zero else 1):
                 state_rows += (

@@ -230,22 +230,23 @@ def lay_out_segments(
 
 
 def check_ticks(
-    message_start: str, ticks: float, rate_hz: float, rest_and_ring_down_s: float = 0.0
+    message_start: str, tick_count: float, rate_hz: float, rest_and_ring_down_s: float = 0.0
 ) -> None:
     """Raise `ExcitationError` if a record has more ticks than can be analysed.
 
     `message_start` is the subject of the message, and `rest_and_ring_down_s` the total duration of
     rest and ring-down.
     """
-    if ticks > MAX_SAMPLES:
-        longest_s = MAX_SAMPLES / rate_hz
+    if tick_count > MAX_SAMPLES:
+        max_duration_s = MAX_SAMPLES / rate_hz
         limit_text = (
-            f" ({longest_s - rest_and_ring_down_s:g} s between rest and ring-down)"
-            if 0.0 < rest_and_ring_down_s < longest_s
+            f" ({max_duration_s - rest_and_ring_down_s:g} s between rest and ring-down)"
+            if 0.0 < rest_and_ring_down_s < max_duration_s
             else ""
         )
         raise ExcitationError(
-            f"{message_start} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at "
+            f"{message_start} would take {tick_count / rate_hz:g} s; {max_duration_s:g} s is "
+            "the most at "
             f"{rate_hz:g} Hz{limit_text}, because no more than {MAX_SAMPLES} samples can be "
             "analysed, exported or replayed: shorten it or run several sessions."
         )
@@ -337,10 +338,10 @@ def chirp(
         )
     segment_ticks = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     if there_and_back:
-        there_ticks = segment_ticks["sweep"]
+        outward_ticks = segment_ticks["sweep"]
         segment_ticks = lay_out_segments(rate_hz, rest_s, 2.0 * duration_s, ring_down_s)
-        back_ticks = there_ticks[1], segment_ticks["sweep"][1]
-        segment_ticks |= {"there": there_ticks, "back": back_ticks}
+        return_ticks = outward_ticks[1], segment_ticks["sweep"][1]
+        segment_ticks |= {"there": outward_ticks, "back": return_ticks}
 
     def angle_at(t: FloatArray) -> FloatArray:
         # Time on the way there and on the way back, where the phase goes on from the turn.

@@ -12,19 +12,19 @@ from rigd.beam import Pole
 from rigd.excitation._beam_estimate import BAND_HZ, BeamEstimate
 from rigd.excitation._fisher_information import covariance_of, responses, whitened_kernels
 from rigd.excitation._shortest_move import MovePlant
-from rigd.excitation._sweeps import SIDE_OFFSET
+from rigd.excitation._sweeps import SIDE_BAND_OFFSET
 from rigd.excitation.moves import quintic
 from rigd.excitation.targets import Quantities
 
 RealArray = NDArray[np.float64]
 
-_SINE_OFFSETS: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
+_SINE_OFFSETS_HALF_WIDTHS: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
 """Distances of the forecast's steady sines from a mode, in half-power half-widths of the mode."""
 
-_MIXTURE_STEPS: Final = 60
+_MIXTURE_SEARCH_STEPS: Final = 60
 """Number of multiplicative steps in the search for a mixture of steady sines."""
 
-UNREACHABLE_S: Final = 1e5
+UNREACHABLE_TIME_S: Final = 1e5
 """Time in s above which the targets count as never reached."""
 
 
@@ -36,14 +36,18 @@ def steady_sines(
     The results are frequencies in Hz and amplitudes of the angle in rad, each of shape (m,).
     `limits` are those of angle, speed, tracking error, torques of motor and coupling, and slope.
     """
-    relative_offsets = [
-        (*(beam_mode.damping_ratio * np.array(_SINE_OFFSETS)), -SIDE_OFFSET, SIDE_OFFSET)
+    relative_frequency_offsets = [
+        (
+            *(beam_mode.damping_ratio * np.array(_SINE_OFFSETS_HALF_WIDTHS)),
+            -SIDE_BAND_OFFSET,
+            SIDE_BAND_OFFSET,
+        )
         for beam_mode in modes
     ]
     frequency_hz = np.array(
         [
             beam_mode.frequency_hz * (1.0 + relative_offset)
-            for beam_mode, mode_offsets in zip(modes, relative_offsets, strict=True)
+            for beam_mode, mode_offsets in zip(modes, relative_frequency_offsets, strict=True)
             for relative_offset in mode_offsets
         ]
     )
@@ -112,33 +116,40 @@ def best_mixture(
     """
     information_rates = _information_rates(estimate, frequency_hz, angle_rad)
     target_stds = np.array(
-        [inf if precision.impossible else precision.target_std for precision in quantities.items]
+        [
+            inf if precision.impossible_reason else precision.target_std
+            for precision in quantities.quantity_precisions
+        ]
     )
     scaled_gradients = quantities.gradients / (target_relaxation * target_stds[:, None])
     if not scaled_gradients.any():
         return SineMixture(np.zeros(frequency_hz.size), scaled_gradients)
-    multipliers = np.ones(len(scaled_gradients))
+    target_multipliers = np.ones(len(scaled_gradients))
     times_s = np.full(frequency_hz.size, 1.0 / frequency_hz.size)
-    for _ in range(_MIXTURE_STEPS):
+    for _ in range(_MIXTURE_SEARCH_STEPS):
         covariance = covariance_of(
             fisher_information + np.tensordot(times_s, information_rates, axes=1), estimate
         )
         gain_directions = scaled_gradients @ covariance
         relative_variances = np.einsum("qi,qi->q", gain_directions, scaled_gradients)
-        multipliers = multipliers * np.maximum(relative_variances, 1e-12) ** 0.5
-        multipliers /= max(float(multipliers.sum()), 1e-300)
+        target_multipliers = target_multipliers * np.maximum(relative_variances, 1e-12) ** 0.5
+        target_multipliers /= max(float(target_multipliers.sum()), 1e-300)
         gain_rates = np.einsum(
-            "q,qi,fij,qj->f", multipliers, gain_directions, information_rates, gain_directions
+            "q,qi,fij,qj->f",
+            target_multipliers,
+            gain_directions,
+            information_rates,
+            gain_directions,
         )
         times_s = times_s * np.sqrt(
             gain_rates / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
         )
         # Scale the total time towards the targets, until they are met or the time is too long.
         times_s *= float(np.clip(np.sqrt(relative_variances.max()), 0.5, 2.0))
-        if times_s.sum() > UNREACHABLE_S:
+        if times_s.sum() > UNREACHABLE_TIME_S:
             break
     multiplier_scales = np.sqrt(
-        multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
+        target_multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
     )
     return SineMixture(times_s, multiplier_scales[:, None] * gain_directions)
 
@@ -152,7 +163,7 @@ def _information_rates(
     return information_rates
 
 
-def least_deviations(
+def least_standard_deviations(
     fisher_information: RealArray,
     estimate: BeamEstimate,
     quantities: Quantities,
@@ -169,7 +180,7 @@ def least_deviations(
     least_stds = np.empty(len(quantities.gradients))
     for row, gradient in enumerate(quantities.gradients):
         times_s = np.full(frequency_hz.size, duration_s / frequency_hz.size)
-        for _ in range(_MIXTURE_STEPS):
+        for _ in range(_MIXTURE_SEARCH_STEPS):
             total_information = fisher_information + np.tensordot(
                 times_s, information_rates, axes=1
             )
@@ -193,12 +204,16 @@ def time_with_ring_up(times_s: RealArray, frequency_hz: RealArray, modes: Sequen
         time_ratios - 2.0 * (1.0 - np.exp(-time_ratios)) + 0.5 * (1.0 - np.exp(-2.0 * time_ratios))
     )
     for beam_mode in modes:
-        range_hz = 1.5 * _SINE_OFFSETS[-1] * beam_mode.damping_ratio * beam_mode.frequency_hz
-        at_mode_s = float(times_s[np.abs(frequency_hz - beam_mode.frequency_hz) < range_hz].sum())
+        mode_range_hz = (
+            1.5 * _SINE_OFFSETS_HALF_WIDTHS[-1] * beam_mode.damping_ratio * beam_mode.frequency_hz
+        )
+        time_at_mode_s = float(
+            times_s[np.abs(frequency_hz - beam_mode.frequency_hz) < mode_range_hz].sum()
+        )
         decay_s = -1.0 / beam_mode.at_rad_s.real
-        if at_mode_s > 0.01 * total_s:
+        if time_at_mode_s > 0.01 * total_s:
             total_s += (
-                decay_s * float(np.interp(at_mode_s / decay_s, information_gain, time_ratios))
-                - at_mode_s
+                decay_s * float(np.interp(time_at_mode_s / decay_s, information_gain, time_ratios))
+                - time_at_mode_s
             )
     return total_s

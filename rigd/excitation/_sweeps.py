@@ -13,16 +13,16 @@ from rigd.excitation._beam_estimate import BAND_HZ
 
 RealArray = NDArray[np.float64]
 
-FADE_S: Final = 0.25
+SWEEP_FADE_S: Final = 0.25
 """Shortest duration in s of a sweep's fade at either end."""
 
-_HALF_WIDTH_HZ: Final = 0.5
+_NARROW_HALF_WIDTH_HZ: Final = 0.5
 """Half the width in Hz of a narrow sweep through a mode."""
 
 _RESONANCE_HALF_WIDTHS: Final = 2.0
 """Half the width of a sweep over a whole resonance, in half-power half-widths of the mode."""
 
-SIDE_OFFSET: Final = 0.06
+SIDE_BAND_OFFSET: Final = 0.06
 """Distance of the off-resonance sweeps from a mode, relative to its frequency. They determine
 stiffness and tool inertia, without which the height of a resonance does not give the damping."""
 
@@ -39,7 +39,7 @@ class SweepBand:
     """Half the width of the band in Hz; 0: a sine."""
     fade_s: float
     """Duration in s of the fade at either end of the sweep."""
-    at_mode: bool = True
+    is_at_mode: bool = True
     """Whether the band is centred at the mode, not on one side of it."""
 
 
@@ -51,15 +51,15 @@ class UnitSweep:
     """Reference angle at each tick of the segment; shape (n,)."""
     angle_rad: RealArray
     """Predicted angle of the motor at each tick of the segment; shape (n,)."""
-    rows: RealArray
+    torque_derivatives: RealArray
     """Whitened derivatives of the torque for the free parameters, from the segment's beginning on;
     shape (k, samples)."""
     weighted_rows: RealArray
-    """Combinations of `rows` with the weights of the mixture; shape (q, samples)."""
-    channels: RealArray
+    """Combinations of `torque_derivatives` with the weights of the mixture; shape (q, samples)."""
+    limit_fractions: RealArray
     """Limited quantities, such as speed and torque, as fractions of their limits; shape
     (6, ticks)."""
-    slope: RealArray
+    tip_slope: RealArray
     """Slope of the tip up to the planning horizon, as a fraction of its limit; shape (samples,)."""
 
 
@@ -69,11 +69,11 @@ class SegmentCandidate:
 
     duration_s: float
     """Duration of the segment in s."""
-    parts: tuple[tuple[SweepBand, float], ...]
+    bands_and_amplitudes: tuple[tuple[SweepBand, float], ...]
     """Bands of the segment, and their amplitudes in rad."""
-    terms: tuple[tuple[float, UnitSweep], ...]
+    amplitudes_and_sweeps: tuple[tuple[float, UnitSweep], ...]
     """Amplitudes in rad and unit sweeps, whose sum of products is the segment."""
-    channels: RealArray
+    limit_fractions: RealArray
     """Limited quantities as fractions of their limits, at one tick in `_LIMIT_CHECK_TICKS`; shape
     (6, ticks)."""
     weighted_rows: RealArray
@@ -81,7 +81,7 @@ class SegmentCandidate:
     (q, samples)."""
     tip_slope: RealArray
     """Slope of the tip as a fraction of its limit; shape (samples,)."""
-    information_s: float
+    information_time_s: float
     """Information up to the planning horizon if the first band is still driven after the segment,
     expressed as the time in s in which the best mixture would give it."""
 
@@ -92,7 +92,7 @@ class SegmentCandidate:
         """
         summed_values: RealArray = sum(
             sweep_factor * getattr(candidate_sweep, attribute_name)
-            for sweep_factor, candidate_sweep in self.terms
+            for sweep_factor, candidate_sweep in self.amplitudes_and_sweeps
         )
         return summed_values
 
@@ -113,11 +113,11 @@ def candidate_bands(modes: Sequence[Pole]) -> list[SweepBand]:
     """Return the frequency bands of candidate sweeps: at every mode, and on either side."""
     sweep_bands = []
     for beam_mode in modes:
-        hz = beam_mode.frequency_hz
+        mode_hz = beam_mode.frequency_hz
         # A sine, a narrow sweep, and one over the whole resonance where that is wider.
-        narrow_half_width_hz = min(_HALF_WIDTH_HZ, 0.2 * hz)
+        narrow_half_width_hz = min(_NARROW_HALF_WIDTH_HZ, 0.2 * mode_hz)
         resonance_half_width_hz = min(
-            _RESONANCE_HALF_WIDTHS * beam_mode.damping_ratio * hz, 0.2 * hz
+            _RESONANCE_HALF_WIDTHS * beam_mode.damping_ratio * mode_hz, 0.2 * mode_hz
         )
         widths_hz = [
             0.0,
@@ -129,19 +129,20 @@ def candidate_bands(modes: Sequence[Pole]) -> list[SweepBand]:
             ),
         ]
         sweep_bands += [
-            SweepBand(beam_mode.mode, hz, offset_width, FADE_S) for offset_width in widths_hz
+            SweepBand(beam_mode.mode, mode_hz, offset_width, SWEEP_FADE_S)
+            for offset_width in widths_hz
         ]
         # Fades as long as the beat with the mode: a shorter one excites the mode as well.
         sweep_bands += [
             SweepBand(
                 beam_mode.mode,
-                (1.0 + offset_step) * hz,
+                (1.0 + offset_step) * mode_hz,
                 0.0,
-                max(FADE_S, 1.0 / (SIDE_OFFSET * hz)),
+                max(SWEEP_FADE_S, 1.0 / (SIDE_BAND_OFFSET * mode_hz)),
                 False,
             )
-            for offset_step in (-SIDE_OFFSET, SIDE_OFFSET)
-            if (1.0 + offset_step) * hz < BAND_HZ
+            for offset_step in (-SIDE_BAND_OFFSET, SIDE_BAND_OFFSET)
+            if (1.0 + offset_step) * mode_hz < BAND_HZ
         ]
     return sweep_bands
 
@@ -165,7 +166,7 @@ def largest_factor(existing_motion: RealArray, added_motion: RealArray) -> float
 
 def describe_candidate(chosen_candidate: SegmentCandidate) -> str:
     """Return a text for the operator with modes, bands, duration and amplitudes of a segment."""
-    sorted_parts = sorted(chosen_candidate.parts, key=lambda part: part[0].middle_hz)
+    sorted_parts = sorted(chosen_candidate.bands_and_amplitudes, key=lambda part: part[0].middle_hz)
     band_texts = [
         f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"
         if band.half_width_hz

@@ -30,7 +30,7 @@ from rigd.excitation._signals import (
     require_within_turn,
 )
 from rigd.excitation.moves import Braking, slew, vibration_free_path
-from rigd.identified_beam import TOUCH
+from rigd.identified_beam import TOUCH_USE
 
 RealArray = NDArray[np.float64]
 
@@ -43,11 +43,11 @@ margin."""
 class TouchPass:
     """Ticks at which one pass in search of an obstacle begins, turns back and ends."""
 
-    begins: int
+    begin_tick: int
     """Tick at which the way out begins; the rest before it belongs to the pass."""
-    returns: int
+    return_tick: int
     """Tick at which the way back begins."""
-    ends: int
+    end_tick: int
     """First tick after the pass."""
 
 
@@ -61,7 +61,7 @@ class Approach:
     """Path on which the motor brakes after a touch."""
     hold_ticks: int
     """Number of ticks from a touch to the way back."""
-    back: RealArray
+    return_path: RealArray
     """Path of the way back from 0 to 1, at the ticks after its start."""
     force_limit_n: float
     """Contact force in N above which the torque is switched off."""
@@ -138,8 +138,8 @@ def touch(
         raise ExcitationError("touch is made for a rig; none was given.")
     require_finite("angle_rad", angle_rad, "rad")
     require_within_turn("angle_rad", angle_rad)
-    by_rad = angle_rad - rig.start_rad
-    if by_rad == 0.0:
+    distance_rad = angle_rad - rig.start_rad
+    if distance_rad == 0.0:
         raise ExcitationError(
             f"angle_rad = {angle_rad:g} rad is the angle at which the motor is now; give another "
             "angle."
@@ -151,52 +151,57 @@ def touch(
     require_not_negative("settle_s", settle_s)
     if passes < 1:
         raise ExcitationError(f"passes = {passes} must be at least 1.")
-    at_least_s = settle_s + abs(by_rad) / speed_rad_s + hold_s
-    check_ticks("The session", passes * at_least_s * rate_hz, rate_hz)
-    move_plant = rig.move_plant(path, TOUCH)
-    way_out_rad = slew(
-        by_rad,
+    min_duration_s = settle_s + abs(distance_rad) / speed_rad_s + hold_s
+    check_ticks("The session", passes * min_duration_s * rate_hz, rate_hz)
+    move_plant = rig.move_plant(path, TOUCH_USE)
+    outward_path_rad = slew(
+        distance_rad,
         speed_rad_s=speed_rad_s,
         acceleration_rad_s2=acceleration_rad_s2,
         rate_hz=rate_hz,
         poles_rad_s=move_plant.poles_rad_s,
     )
-    braking = shortest_braking(move_plant, np.concatenate([[0.0, 0.0], way_out_rad]))
+    braking = shortest_braking(move_plant, np.concatenate([[0.0, 0.0], outward_path_rad]))
     hold_ticks = ceil(hold_s * rate_hz)
     if hold_s < braking.duration_s:
         raise ExcitationError(
             f"hold_s = {hold_s:g} s ends before the motor has stopped, which takes "
             f"{braking.duration_s:.3g} s; hold longer."
         )
-    slowest_rad_s = float(np.abs(move_plant.poles_rad_s).min(initial=np.inf))
+    lowest_pole_rad_s = float(np.abs(move_plant.poles_rad_s).min(initial=np.inf))
     # At least one period of the slowest mode: a path that leaves it at rest is then gentle.
     return_duration_s = max(
-        _PEAK_OVER_MEAN_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s
+        _PEAK_OVER_MEAN_SPEED * abs(distance_rad) / speed_rad_s, 2 * np.pi / lowest_pole_rad_s
     )
     return_path = vibration_free_path(return_duration_s, rate_hz, move_plant.poles_rad_s)
     rest_rad = np.zeros(ceil(settle_s * rate_hz))
-    single_pass = np.concatenate(
-        [rest_rad, way_out_rad, np.full(hold_ticks, by_rad), by_rad * (1.0 - return_path)]
+    single_pass_rad = np.concatenate(
+        [
+            rest_rad,
+            outward_path_rad,
+            np.full(hold_ticks, distance_rad),
+            distance_rad * (1.0 - return_path),
+        ]
     )
-    check_ticks("The session", passes * single_pass.size, rate_hz)
+    check_ticks("The session", passes * single_pass_rad.size, rate_hz)
     segment_ticks = lay_out_segments(
-        rate_hz, rest_s, passes * single_pass.size / rate_hz, ring_down_s
+        rate_hz, rest_s, passes * single_pass_rad.size / rate_hz, ring_down_s
     )
     sweep_begin = segment_ticks["sweep"][0]
     approach = Approach(
         passes=tuple(
             TouchPass(
-                begins=pass_begin + rest_rad.size,
-                returns=pass_begin + single_pass.size - return_path.size,
-                ends=pass_begin + single_pass.size,
+                begin_tick=pass_begin + rest_rad.size,
+                return_tick=pass_begin + single_pass_rad.size - return_path.size,
+                end_tick=pass_begin + single_pass_rad.size,
             )
             for pass_begin in range(
-                sweep_begin, sweep_begin + passes * single_pass.size, single_pass.size
+                sweep_begin, sweep_begin + passes * single_pass_rad.size, single_pass_rad.size
             )
         ),
         braking=braking,
         hold_ticks=hold_ticks,
-        back=return_path,
+        return_path=return_path,
         force_limit_n=force_limit_n,
     )
     parameters: dict[str, float | int | str] = {
@@ -210,14 +215,14 @@ def touch(
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
         "file": str(path),
-        "by_rad": by_rad,
+        "by_rad": distance_rad,
         "braking_s": braking.duration_s,
     }
     return TouchExcitation(
         kind="touch",
         parameters=parameters,
         rate_hz=rate_hz,
-        reference_rad=assemble_reference(segment_ticks, np.tile(single_pass, passes)),
+        reference_rad=assemble_reference(segment_ticks, np.tile(single_pass_rad, passes)),
         segments=segment_ticks,
         model=move_plant.model,
         motion=(
@@ -231,9 +236,9 @@ def touch(
 
 def reference_after_touch(
     approach: Approach,
-    pass_end: int,
+    pass_end_tick: int,
     tick: int,
-    recent_rad: tuple[float, float, float],
+    recent_angles_rad: tuple[float, float, float],
     start_rad: float,
 ) -> RealArray:
     """Return the reference for the rest of a pass after a touch: brake, hold, and return.
@@ -242,37 +247,37 @@ def reference_after_touch(
     ----------
     approach
         Passes and reaction to a touch.
-    pass_end
+    pass_end_tick
         First tick after the pass.
     tick
         Tick at which the touch was detected, before the way back begins.
-    recent_rad
+    recent_angles_rad
         Reference angles two ticks before `tick`, one tick before it, and at it.
     start_rad
         Reference angle at the beginning of the pass.
 
     Returns
     -------
-    ndarray of shape (ends - tick - 1,)
+    ndarray of shape (pass_end_tick - tick - 1,)
         Reference angles in rad at the ticks after `tick`.
     """
-    braking, return_path = approach.braking, approach.back
-    angle_two_ticks_before, angle_one_tick_before, present_angle = recent_rad
+    braking, return_path = approach.braking, approach.return_path
+    angle_two_ticks_before, angle_one_tick_before, present_angle = recent_angles_rad
     acceleration_rad_s2 = (
         present_angle - 2 * angle_one_tick_before + angle_two_ticks_before
     ) * braking.rate_hz**2
     speed_rad_s = (
         present_angle - angle_one_tick_before
     ) * braking.rate_hz + acceleration_rad_s2 / (2 * braking.rate_hz)
-    reference_rad = np.full(pass_end - tick - 1, start_rad)
-    braking_rad = braking.path(present_angle, speed_rad_s, acceleration_rad_s2)
+    reference_rad = np.full(pass_end_tick - tick - 1, start_rad)
+    braking_path_rad = braking.path(present_angle, speed_rad_s, acceleration_rad_s2)
     return_index = reference_rad.size - return_path.size
     held_ticks = min(approach.hold_ticks, return_index)
-    held_rad = braking_rad[-1]
-    reference_rad[:held_ticks] = held_rad
+    held_angle_rad = braking_path_rad[-1]
+    reference_rad[:held_ticks] = held_angle_rad
     # A touch during the pause needs no braking; the remaining pause follows.
-    reference_rad[: min(held_ticks, len(braking_rad))] = braking_rad[:held_ticks]
+    reference_rad[: min(held_ticks, len(braking_path_rad))] = braking_path_rad[:held_ticks]
     reference_rad[held_ticks : held_ticks + return_path.size] = (
-        held_rad + (start_rad - held_rad) * return_path
+        held_angle_rad + (start_rad - held_angle_rad) * return_path
     )
     return reference_rad

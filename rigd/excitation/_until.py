@@ -32,10 +32,10 @@ from rigd.units import with_percentage
 
 RealArray = NDArray[np.float64]
 
-PAUSE_S: Final = 0.5
+SEGMENT_PAUSE_S: Final = 0.5
 """Pause in s of the reference for a fit, such as the first. The record gains information meanwhile,
 because the beam still rings."""
-_FADE_S: Final = 0.25
+_SCAN_FADE_S: Final = 0.25
 """Duration in s of the scan's fade at either end."""
 _SCAN_LIMIT_FRACTION: Final = 0.8
 """Largest fraction of the limits that the scan uses, since the beam may differ from the profile."""
@@ -206,13 +206,14 @@ def until(
         )
     segment_ticks = lay_out_segments(rate_hz, rest_s, scan_s, 0.0)
     scan_begin, sweep_end = segment_ticks["sweep"]
-    if scan_s < 2 * _FADE_S:
+    if scan_s < 2 * _SCAN_FADE_S:
         raise ExcitationError(
-            f"scan_s = {scan_s:g} s is too short for fades of {_FADE_S:g} s at both ends; choose "
-            f"at least {2 * _FADE_S:g} s."
+            f"scan_s = {scan_s:g} s is too short for fades of {_SCAN_FADE_S:g} s at both ends; "
+            "choose "
+            f"at least {2 * _SCAN_FADE_S:g} s."
         )
     check_ticks("With at_most_s, the session", at_most_s * rate_hz, rate_hz)
-    planned_ticks = sweep_end + round(PAUSE_S * rate_hz)
+    planned_ticks = sweep_end + round(SEGMENT_PAUSE_S * rate_hz)
     record_ticks = round(at_most_s * rate_hz)
     if record_ticks < planned_ticks:
         raise ExcitationError(
@@ -284,13 +285,13 @@ def _require_reachable_targets(
     geometry_limits = geometry_floors(
         rig.stated_estimate, rig, targets, uniformity, at_most_s, tip_slope_rad
     )
-    unreachable_floors = [floor for floor in geometry_limits if floor.makes_unreachable]
+    unreachable_floors = [floor for floor in geometry_limits if floor.makes_target_unreachable]
     if not unreachable_floors:
         return
     floors_text = "; ".join(
         f"{floor.target} (standard deviation) is below the floor of "
         f"{with_percentage(floor.std, floor.value)}, "
-        f"{with_percentage(floor.exact_std, floor.value)} if the beam "
+        f"{with_percentage(floor.exact_geometry_std, floor.value)} if the beam "
         "is exactly uniform"
         for floor in unreachable_floors
     )
@@ -303,14 +304,14 @@ def _require_reachable_targets(
 
 
 def _unit_scan(
-    n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None
+    tick_count: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None
 ) -> RealArray:
     """Return a quick sweep of n ticks with largest amplitude 1, at rest at both ends; shape (n,).
 
     With a beam, the amplitude depends on the frequency relative to the beam's first mode.
     """
-    t = np.arange(n) / rate_hz
-    u = t * (rate_hz / n)
+    t = np.arange(tick_count) / rate_hz
+    u = t * (rate_hz / tick_count)
     frequency_hz = start_hz + (stop_hz - start_hz) * u**_SCAN_FREQUENCY_POWER
     phase_rad = (
         2.0
@@ -321,10 +322,10 @@ def _unit_scan(
             + (stop_hz - start_hz) * u**_SCAN_FREQUENCY_POWER / (_SCAN_FREQUENCY_POWER + 1.0)
         )
     )
-    relative_amplitude = np.ones(n)
+    relative_amplitude = np.ones(tick_count)
     if beam is not None:
-        first_hz = undamped_frequencies_rad_s(beam, 1)[0] / (2.0 * pi)
-        relative_frequency = np.maximum(frequency_hz / first_hz, _SCAN_RELATIVE_FREQUENCIES[0])
+        first_mode_hz = undamped_frequencies_rad_s(beam, 1)[0] / (2.0 * pi)
+        relative_frequency = np.maximum(frequency_hz / first_mode_hz, _SCAN_RELATIVE_FREQUENCIES[0])
         relative_amplitude = np.exp(
             np.interp(
                 np.log(relative_frequency),
@@ -332,9 +333,9 @@ def _unit_scan(
                 np.log(_SCAN_RELATIVE_AMPLITUDES),
             )
         )
-    fade_factors = quintic(_FADE_S, rate_hz)
+    fade_factors = quintic(_SCAN_FADE_S, rate_hz)
     relative_amplitude[: fade_factors.size] *= fade_factors
-    relative_amplitude[n - fade_factors.size :] *= 1.0 - fade_factors
+    relative_amplitude[tick_count - fade_factors.size :] *= 1.0 - fade_factors
     unit_sweep: RealArray = relative_amplitude * np.sin(phase_rad)
     return unit_sweep
 

@@ -34,7 +34,7 @@ from rigd.excitation._segment_search import (
 )
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import ExcitationError
-from rigd.excitation._sine_mixture import least_deviations
+from rigd.excitation._sine_mixture import least_standard_deviations
 from rigd.excitation.targets import MODE_QUANTITIES, Precision, Quantities, Target
 
 RealArray = NDArray[np.float64]
@@ -88,7 +88,7 @@ def next_segment(
     time_left_s: float,
     *,
     tip_slope_rad: float = SMALL_TIP_SLOPE_RAD,
-    through: Collection[int] = (),
+    modes_to_drive: Collection[int] = (),
     limit_fraction: float = 1.0,
 ) -> Segment:
     """Return the segment of excitation that reduces the targets' standard deviations most.
@@ -109,7 +109,7 @@ def next_segment(
         Remaining time of the session in s; the segment is not longer.
     tip_slope_rad
         Largest slope of the tip for which the linear model is valid.
-    through
+    modes_to_drive
         Numbers of modes of which the segment must drive one; empty: the segment drives the most
         informative modes.
     limit_fraction
@@ -120,9 +120,11 @@ def next_segment(
     ExcitationError
         If there is no target, or no segment fits into the time or drives a mode.
     """
-    driven_modes = [beam_mode.mode for beam_mode in estimate.modes() if beam_mode.mode in through]
-    quantities = Quantities.linearised(targets, estimate)
-    if not quantities.items:
+    driven_modes = [
+        beam_mode.mode for beam_mode in estimate.modes() if beam_mode.mode in modes_to_drive
+    ]
+    quantities = Quantities.from_targets(targets, estimate)
+    if not quantities.quantity_precisions:
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
     move_plant = rig.plant_with(estimate.plant)
     record_so_far = RecordSoFar.from_angle(
@@ -153,14 +155,16 @@ class GeometryFloor:
     """Value of the quantity."""
     std: float
     """Smallest standard deviation with the tolerance of the geometry."""
-    exact_std: float
+    exact_geometry_std: float
     """Smallest standard deviation if the beam were exactly uniform."""
 
     @property
-    def makes_unreachable(self) -> bool:
+    def makes_target_unreachable(self) -> bool:
         """Whether the beam's non-uniformity makes the target standard deviation unreachable."""
-        target_std = self.target.std * (abs(self.value) if self.target.relative else 1.0)
-        return target_std < self.std and self.std > _GEOMETRY_DOMINANCE_RATIO * self.exact_std
+        target_std = self.target.std * (abs(self.value) if self.target.is_relative else 1.0)
+        return (
+            target_std < self.std and self.std > _GEOMETRY_DOMINANCE_RATIO * self.exact_geometry_std
+        )
 
 
 def geometry_floors(
@@ -206,16 +210,16 @@ def geometry_floors(
     resting_record = RecordSoFar.from_angle(
         np.zeros(1), estimate, move_plant.rate_hz, SHORTEST_SEGMENT_S
     )
-    quantities = Quantities.linearised(targets, estimate)
+    quantities = Quantities.from_targets(targets, estimate)
     segment_search = SegmentSearch(
         estimate, quantities, move_plant, rig.start_rad, resting_record, tip_slope_rad
     )
     tolerant_estimate = estimate.with_tolerance(uniformity)
-    floors = [
-        least_deviations(
+    least_stds = [
+        least_standard_deviations(
             np.zeros((len(beam_estimate.names), len(beam_estimate.names))),
             beam_estimate,
-            Quantities.linearised(targets, beam_estimate),
+            Quantities.from_targets(targets, beam_estimate),
             segment_search.line_hz,
             segment_search.line_amplitudes_rad,
             duration_s,
@@ -223,11 +227,14 @@ def geometry_floors(
         for beam_estimate in (tolerant_estimate, estimate)
     ]
     return tuple(
-        GeometryFloor(quantity_precision.target, quantity_precision.value, std, exact_std)
-        for quantity_precision, std, exact_std in zip(
-            quantities.items, floors[0].tolist(), floors[1].tolist(), strict=True
+        GeometryFloor(quantity_precision.target, quantity_precision.value, std, exact_geometry_std)
+        for quantity_precision, std, exact_geometry_std in zip(
+            quantities.quantity_precisions,
+            least_stds[0].tolist(),
+            least_stds[1].tolist(),
+            strict=True,
         )
-        if not quantity_precision.impossible
+        if not quantity_precision.impossible_reason
     )
 
 
@@ -248,7 +255,7 @@ def expected_precisions(
         Rate of the angle.
     """
     covariance = covariance_of(information(angle_rad, estimate, rate_hz), estimate)
-    return Quantities.linearised(targets, estimate).precisions(covariance)
+    return Quantities.from_targets(targets, estimate).precisions(covariance)
 
 
 def design_excitation(
@@ -305,7 +312,7 @@ def design_excitation(
     (True, True)
     """
     move_plant = rig.plant_with(estimate.plant)
-    before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
+    earlier_angle_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
     reference_rad = angle_rad = np.zeros(0)
     remaining_s = duration_s
     planned_segments: list[Segment] = []
@@ -315,9 +322,9 @@ def design_excitation(
             planned_segment.reached for planned_segment in planned_segments[-1].expected_precisions
         )
     ):
-        whole_angle_rad = np.concatenate([before_rad, angle_rad])
+        total_angle_rad = np.concatenate([earlier_angle_rad, angle_rad])
         new_segment = next_segment(
-            estimate, whole_angle_rad, targets, rig, remaining_s, tip_slope_rad=tip_slope_rad
+            estimate, total_angle_rad, targets, rig, remaining_s, tip_slope_rad=tip_slope_rad
         )
         planned_segments.append(new_segment)
         reference_rad = np.concatenate([reference_rad, new_segment.reference_rad])

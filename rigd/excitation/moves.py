@@ -19,11 +19,11 @@ from rigd.excitation._signals import require_positive
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complexfloating]
 
-ROBUST_BELOW_HZ = 60.0
+MAX_ROBUST_MODE_HZ = 60.0
 """Frequency in Hz below which a robust move has zeros of second order for the modes. Higher modes
 are too weak to matter after a change of 1 % in their frequency."""
 
-_MAX_PEAK_ACCELERATION = 24.0
+_MAX_RELATIVE_ACCELERATION = 24.0
 """Largest acceleration of a path, divided by ``distance / duration²``: four times a quintic's. A
 path shorter than about half a period of a mode would exceed it, and then has fewer zeros."""
 
@@ -81,18 +81,20 @@ def vibration_free_path(duration_s: float, rate_hz: float, poles_rad_s: ComplexA
     """
     n = max(1, round(duration_s * rate_hz))
     for order_of_zeros in (2, 1):
-        linear_map = np.concatenate(
+        constraint_matrix = np.concatenate(
             [
                 _motion_map(n, rate_hz),
                 residual_vibration_map(n, rate_hz, poles_rad_s, order_of_zeros),
             ]
         )
-        if len(linear_map) > n:
+        if len(constraint_matrix) > n:
             continue
-        unit_accelerations, is_solved = _least_norm_solution(linear_map, np.array([0.0, 1.0]))
+        unit_accelerations, is_solved = _least_norm_solution(
+            constraint_matrix, np.array([0.0, 1.0])
+        )
         if (
             is_solved
-            and np.abs(unit_accelerations).max() * (n / rate_hz) ** 2 <= _MAX_PEAK_ACCELERATION
+            and np.abs(unit_accelerations).max() * (n / rate_hz) ** 2 <= _MAX_RELATIVE_ACCELERATION
         ):
             return from_acceleration(unit_accelerations, rate_hz)
     return quintic(duration_s, rate_hz)
@@ -136,37 +138,42 @@ def slew(
     """
     require_positive("speed_rad_s", speed_rad_s, "rad/s")
     require_positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
-    slowest_rad_s = float(np.abs(poles_rad_s.imag[poles_rad_s.imag != 0]).min(initial=np.inf))
+    lowest_mode_rad_s = float(np.abs(poles_rad_s.imag[poles_rad_s.imag != 0]).min(initial=np.inf))
     cruise_speed_rad_s = speed_rad_s
-    n = max(4 * len(poles_rad_s), round(rate_hz * np.pi / slowest_rad_s), 8)
+    pulse_ticks = max(4 * len(poles_rad_s), round(rate_hz * np.pi / lowest_mode_rad_s), 8)
     while True:
-        start_pulse = _speed_change_pulse(n, rate_hz, poles_rad_s)
+        start_pulse = _speed_change_pulse(pulse_ticks, rate_hz, poles_rad_s)
         # Both pulses together cover the distance of one at full speed.
-        cruise_speed_rad_s = min(speed_rad_s, abs(distance_rad) * rate_hz / n)
+        cruise_speed_rad_s = min(speed_rad_s, abs(distance_rad) * rate_hz / pulse_ticks)
         if (
             start_pulse is not None
             and cruise_speed_rad_s * np.abs(start_pulse).max() <= acceleration_rad_s2
         ):
             break
-        n = n + max(1, n // 20)
-    cruise_ticks = round(abs(distance_rad) / cruise_speed_rad_s * rate_hz) - n
+        pulse_ticks = pulse_ticks + max(1, pulse_ticks // 20)
+    cruise_ticks = round(abs(distance_rad) / cruise_speed_rad_s * rate_hz) - pulse_ticks
     # With a whole number of cruise ticks the speed is slightly lower than requested.
-    cruise_speed_rad_s = abs(distance_rad) * rate_hz / (n + cruise_ticks)
+    cruise_speed_rad_s = abs(distance_rad) * rate_hz / (pulse_ticks + cruise_ticks)
     accelerations_rad_s2 = np.concatenate([start_pulse, np.zeros(cruise_ticks), -start_pulse])
     return from_acceleration(
         np.copysign(cruise_speed_rad_s, distance_rad) * accelerations_rad_s2, rate_hz
     )
 
 
-def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: ComplexArray) -> RealArray | None:
+def _speed_change_pulse(
+    tick_count: int, rate_hz: float, poles_rad_s: ComplexArray
+) -> RealArray | None:
     """Return the accelerations (n,) of least norm that change the speed by 1 rad/s.
 
-    They leave all modes at rest. Return None if `n` ticks are too few.
+    They leave all modes at rest. Return None if `tick_count` ticks are too few.
     """
-    linear_map = np.concatenate(
-        [_motion_map(n, rate_hz)[:1], residual_vibration_map(n, rate_hz, poles_rad_s, 1)]
+    constraint_matrix = np.concatenate(
+        [
+            _motion_map(tick_count, rate_hz)[:1],
+            residual_vibration_map(tick_count, rate_hz, poles_rad_s, 1),
+        ]
     )
-    unit_pulse, is_solved = _least_norm_solution(linear_map, np.array([1.0]))
+    unit_pulse, is_solved = _least_norm_solution(constraint_matrix, np.array([1.0]))
     return unit_pulse if is_solved else None
 
 
@@ -184,25 +191,25 @@ def from_acceleration(acceleration_rad_s2: RealArray, rate_hz: float) -> RealArr
     return reference_rad
 
 
-def _motion_map(n: int, rate_hz: float) -> RealArray:
+def _motion_map(tick_count: int, rate_hz: float) -> RealArray:
     """Return the linear map, shape (2, n), from n accelerations to change of speed and distance."""
-    remaining_ticks = n - np.arange(n)
-    return np.stack([np.full(n, 1.0 / rate_hz), remaining_ticks / rate_hz**2])
+    ticks_to_end = tick_count - np.arange(tick_count)
+    return np.stack([np.full(tick_count, 1.0 / rate_hz), ticks_to_end / rate_hz**2])
 
 
 def residual_vibration_map(
-    n: int, rate_hz: float, poles_rad_s: ComplexArray, order_of_zeros: int
+    tick_count: int, rate_hz: float, poles_rad_s: ComplexArray, order_of_zeros: int
 ) -> RealArray:
     """Return the linear map from n accelerations to the modes' vibration after the last one.
 
     Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
     row for the real part and one for the imaginary part of its complex state at the end of the
-    path. With ``order_of_zeros`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative
-    by the pole as well. The shape is (rows, n).
+    path. With ``order_of_zeros`` 2 the modes below `MAX_ROBUST_MODE_HZ` have rows for the
+    derivative by the pole as well. The shape is (rows, ticks).
 
     Parameters
     ----------
-    n
+    tick_count
         Number of ticks of the path.
     rate_hz
         Ticks a second.
@@ -211,36 +218,40 @@ def residual_vibration_map(
     order_of_zeros
         Order of the zeros: 1 or 2.
     """
-    remaining_s = (n - np.arange(n)) / rate_hz
+    time_to_end_s = (tick_count - np.arange(tick_count)) / rate_hz
     map_rows: list[RealArray] = []
     for mode_pole in poles_rad_s:
-        pole_transform = np.exp(mode_pole * remaining_s) / rate_hz
-        second_order = order_of_zeros > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
+        pole_transform = np.exp(mode_pole * time_to_end_s) / rate_hz
+        has_second_order_zero = (
+            order_of_zeros > 1 and abs(mode_pole) < 2 * np.pi * MAX_ROBUST_MODE_HZ
+        )
         for row in (
-            (pole_transform, pole_transform * remaining_s / remaining_s[0])
-            if second_order
+            (pole_transform, pole_transform * time_to_end_s / time_to_end_s[0])
+            if has_second_order_zero
             else (pole_transform,)
         ):
             map_rows.append(row.real)
             if mode_pole.imag != 0.0:
                 map_rows.append(row.imag)
-    return np.array(map_rows).reshape(-1, n)
+    return np.array(map_rows).reshape(-1, tick_count)
 
 
-def _least_norm_solution(linear_map: RealArray, wanted_values: RealArray) -> tuple[RealArray, bool]:
+def _least_norm_solution(
+    constraint_matrix: RealArray, required_values: RealArray
+) -> tuple[RealArray, bool]:
     """Return the least-squares solution a of ``linear_map @ a = wanted_values``, of least norm.
 
     The second result is whether a solves the equations within rounding errors.
 
-    Rows beyond the length of `wanted_values` have the right-hand side 0.
+    Rows beyond the length of `required_values` have the right-hand side 0.
     """
-    right_hand_side = np.zeros(len(linear_map))
-    right_hand_side[: wanted_values.size] = wanted_values
-    row_norms = np.linalg.norm(linear_map, axis=1)
+    right_hand_side = np.zeros(len(constraint_matrix))
+    right_hand_side[: required_values.size] = required_values
+    row_norms = np.linalg.norm(constraint_matrix, axis=1)
     least_norm = np.linalg.lstsq(
-        linear_map / row_norms[:, None], right_hand_side / row_norms, rcond=1e-12
+        constraint_matrix / row_norms[:, None], right_hand_side / row_norms, rcond=1e-12
     )[0]
-    relative_residuals = np.abs(linear_map @ least_norm - right_hand_side) / row_norms
+    relative_residuals = np.abs(constraint_matrix @ least_norm - right_hand_side) / row_norms
     return least_norm, bool(relative_residuals.max() <= 1e-9 * np.linalg.norm(least_norm))
 
 
@@ -267,9 +278,9 @@ def modal_state(
     """
     accelerations_rad_s2 = np.diff(reference_rad, n=2, prepend=(reference_rad[0],) * 2) * rate_hz**2
     # r[k+1] - 2 r[k] + r[k-1] belongs to tick k: one before the sample in which it shows.
-    remaining_s = np.arange(accelerations_rad_s2.size, 0, -1) / rate_hz
+    time_to_end_s = np.arange(accelerations_rad_s2.size, 0, -1) / rate_hz
     modal_states: ComplexArray = (
-        np.exp(np.outer(poles_rad_s, remaining_s)) @ accelerations_rad_s2 / rate_hz
+        np.exp(np.outer(poles_rad_s, time_to_end_s)) @ accelerations_rad_s2 / rate_hz
     )
     return modal_states
 
@@ -287,7 +298,7 @@ class Braking:
 
     rate_hz: float
     """Ticks a second."""
-    per_speed_s: tuple[float, ...]
+    path_per_speed_s: tuple[float, ...]
     """Angle covered at the ticks after the start, per speed at the start; in s."""
     per_acceleration_s2: tuple[float, ...]
     """Angle covered at the ticks after the start, per acceleration at the start; in s²."""
@@ -295,7 +306,7 @@ class Braking:
     @property
     def duration_s(self) -> float:
         """Time in s from the start of braking to standstill."""
-        return len(self.per_speed_s) / self.rate_hz
+        return len(self.path_per_speed_s) / self.rate_hz
 
     def path(
         self, angle_rad: float, speed_rad_s: float, acceleration_rad_s2: float = 0.0
@@ -312,7 +323,7 @@ class Braking:
         return [
             angle_rad + speed_rad_s * speed_factor_s + acceleration_rad_s2 * acceleration_factor_s2
             for speed_factor_s, acceleration_factor_s2 in zip(
-                self.per_speed_s, self.per_acceleration_s2, strict=True
+                self.path_per_speed_s, self.per_acceleration_s2, strict=True
             )
         ]
 

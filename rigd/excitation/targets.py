@@ -23,14 +23,20 @@ QUANTITIES: Final = (*MODE_QUANTITIES, *DAMPING_PARAMETERS)
 """Names of the quantities whose precision can be a target: damping ratio and frequency of modes,
 and the parameters of the damping."""
 
-_UNITS: Final = {"frequency": "Hz"}
+_UNIT_BY_QUANTITY: Final = {"frequency": "Hz"}
 """Unit of each target quantity that has one."""
-_USELESS_STD: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5, "lambda": 0.5}
+_USELESS_STD_BY_QUANTITY: Final = {
+    "damping": 0.01,
+    "zeta": 0.5,
+    "alpha": 0.5,
+    "gamma": 0.5,
+    "lambda": 0.5,
+}
 """Standard deviation of each quantity, in its unit, from which a target is useless: the percent
 sign was probably forgotten."""
 _MAX_MODE_NUMBER: Final = 20
 """Largest number of a mode in a target."""
-_DAMPING_KIND: Final = {
+_DAMPING_KIND_BY_PARAMETER: Final = {
     "zeta": "internal",
     "alpha": "internal",
     "gamma": "external",
@@ -48,7 +54,7 @@ class Target:
     std: float
     """Requested standard deviation: a fraction of the value if `relative`, else in the unit of the
     quantity (a ratio, Hz, s^alpha, s^lambda/m⁴)."""
-    relative: bool
+    is_relative: bool
     """Whether the standard deviation is a fraction of the value."""
     mode: int | None = None
     """Number of the mode, from 1; None: every mode in the band, or a quantity without modes."""
@@ -60,8 +66,8 @@ class Target:
 
     def __str__(self) -> str:
         """Return quantity and requested standard deviation as text, for the operator."""
-        unit = _UNITS.get(self.quantity, "")
-        std_text = f"{100 * self.std:g} %" if self.relative else f"{self.std:g} {unit}".rstrip()
+        unit = _UNIT_BY_QUANTITY.get(self.quantity, "")
+        std_text = f"{100 * self.std:g} %" if self.is_relative else f"{self.std:g} {unit}".rstrip()
         return f"{self.name} to {std_text}"
 
 
@@ -93,7 +99,7 @@ def parse_target(quantity: str, text: str) -> Target:
             f"The precision of {quantity!r} cannot be requested; choose from "
             f"{', '.join(QUANTITIES)}."
         )
-    option, unit = f"--{quantity} {text}", _UNITS.get(quantity, "")
+    option, unit = f"--{quantity} {text}", _UNIT_BY_QUANTITY.get(quantity, "")
     example_text = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
         quantity, "5% or 0.01"
     )
@@ -127,7 +133,7 @@ def parse_target(quantity: str, text: str) -> Target:
             f"{option}: the standard deviation must be finite and more than 0; give for example "
             f"{example_text}."
         )
-    useless_std = _USELESS_STD.get(quantity, inf)
+    useless_std = _USELESS_STD_BY_QUANTITY.get(quantity, inf)
     if not is_relative and std >= useless_std:
         raise ExcitationError(
             f"{option}: a standard deviation of {std:g} says nothing about {quantity}; give less "
@@ -148,13 +154,13 @@ class Precision:
     """Standard deviation of the estimated value."""
     target_std: float
     """Target standard deviation, in the same unit; 0 for a percentage of a value of 0."""
-    impossible: str = ""
+    impossible_reason: str = ""
     """Reason why no record can determine the quantity; empty if a record can."""
 
     @property
     def ratio(self) -> float:
         """Ratio of the standard deviation to the requested one; 1 or less: reached."""
-        if self.impossible:
+        if self.impossible_reason:
             return inf
         return self.std / self.target_std if self.target_std > 0.0 else inf
 
@@ -168,13 +174,13 @@ class Precision:
 class Quantities:
     """Quantities with a requested precision, as linear functions of the beam's parameters."""
 
-    items: tuple[Precision, ...]
+    quantity_precisions: tuple[Precision, ...]
     """Value and target of each quantity; the standard deviations are still unknown."""
     gradients: RealArray
     """Derivatives of the q quantities with respect to the k free parameters, shape (q, k)."""
 
     @classmethod
-    def linearised(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
+    def from_targets(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
         """Return the quantities with a requested precision, linearised at an estimate of the beam.
 
         Parameters
@@ -193,7 +199,7 @@ class Quantities:
                 )
                 target_std = (
                     single_target.std * abs(quantity_value)
-                    if single_target.relative
+                    if single_target.is_relative
                     else single_target.std
                 )
                 if target_std == 0.0 and not impossible_reason:
@@ -209,7 +215,7 @@ class Quantities:
             np.array(gradients).reshape(len(quantity_items), len(estimate.free_parameters)),
         )
 
-    def ratios(self, covariance: RealArray) -> RealArray:
+    def std_to_target_ratios(self, covariance: RealArray) -> RealArray:
         """Return the ratio of each quantity's standard deviation to its target, shape (q,).
 
         The ratio is 0 for a quantity that no record can determine.
@@ -221,10 +227,13 @@ class Quantities:
         """
         variances = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
         target_std = np.array(
-            [inf if precision.impossible else precision.target_std for precision in self.items]
+            [
+                inf if precision.impossible_reason else precision.target_std
+                for precision in self.quantity_precisions
+            ]
         )
-        ratios: RealArray = np.sqrt(np.maximum(variances, 0.0)) / target_std
-        return ratios
+        std_to_target_ratios: RealArray = np.sqrt(np.maximum(variances, 0.0)) / target_std
+        return std_to_target_ratios
 
     def precisions(self, covariance: RealArray) -> tuple[Precision, ...]:
         """Return each quantity's standard deviation for a covariance (k, k) of the parameters."""
@@ -233,7 +242,9 @@ class Quantities:
                 precision,
                 std=sqrt(max(float(quantity_gradient @ covariance @ quantity_gradient), 0.0)),
             )
-            for precision, quantity_gradient in zip(self.items, self.gradients, strict=True)
+            for precision, quantity_gradient in zip(
+                self.quantity_precisions, self.gradients, strict=True
+            )
         )
 
 
@@ -286,7 +297,8 @@ def _linearise(
         return (
             quantity_value,
             quantity_gradient,
-            f"{_DAMPING_KIND[quantity_name]} damping {impossible_reason} in the estimate so far",
+            f"{_DAMPING_KIND_BY_PARAMETER[quantity_name]} damping {impossible_reason} in the "
+            "estimate so far",
         )
     quantity_gradient[estimate.free_parameters.index(quantity_name)] = (
         quantity_value if quantity_name in LOGARITHMIC_PARAMETERS else 1.0

@@ -100,13 +100,13 @@ class ProposalRow:
 
     key: str
     """Dotted key of the number in the profile."""
-    measured: MotorQuantity
+    measured_quantity: MotorQuantity
     """Estimate of the number."""
     profile_value: float
     """Value of the number in the profile."""
     source: str
     """Origin of the profile's value, as the profile states it."""
-    least: float = 0.0
+    min_allowed: float = 0.0
     """Smallest value that the profile's other settings allow."""
 
     @property
@@ -115,10 +115,12 @@ class ProposalRow:
         return unit_of(self.key)
 
     @property
-    def is_below_least(self) -> bool:
+    def is_below_min_allowed(self) -> bool:
         """Whether the estimate is significantly below the smallest allowed value."""
-        smallest_plausible = self.least - _SIGNIFICANT_STDS * (self.measured.std or 0.0)
-        return self.least > 0.0 and self.measured.value < smallest_plausible
+        min_plausible_value = self.min_allowed - _SIGNIFICANT_STDS * (
+            self.measured_quantity.std or 0.0
+        )
+        return self.min_allowed > 0.0 and self.measured_quantity.value < min_plausible_value
 
     @property
     def differs(self) -> bool | None:
@@ -126,19 +128,22 @@ class ProposalRow:
 
         It is None if the quantity was not estimated.
         """
-        if self.measured.std is None:
+        if self.measured_quantity.std is None:
             return None
-        return abs(self.measured.value - self.profile_value) > _SIGNIFICANT_STDS * self.measured.std
+        return (
+            abs(self.measured_quantity.value - self.profile_value)
+            > _SIGNIFICANT_STDS * self.measured_quantity.std
+        )
 
     def toml(self) -> str:
         """Return a line of TOML that enters the estimate in the profile.
 
         The smallest allowed value replaces an estimate that is insignificantly below it.
         """
-        std = self.measured.std or 0.0
-        value_text, std_text = _format_with_std(self.measured.value, std)
-        if not self.is_below_least and float(value_text) < self.least:
-            value_text = f"{self.least:g}"
+        std = self.measured_quantity.std or 0.0
+        value_text, std_text = _format_with_std(self.measured_quantity.value, std)
+        if not self.is_below_min_allowed and float(value_text) < self.min_allowed:
+            value_text = f"{self.min_allowed:g}"
         key_name = self.key.rpartition(".")[2]
         return (
             f'{key_name} = {{ value = {value_text}, source = "measured" }}  # ± {std_text} '
@@ -162,10 +167,12 @@ class Proposal:
         column_titles = ("", "measured", "± std", "profile", "source", "")
         table_cells = [column_titles]
         for row in self.rows:
-            if row.measured.std is None:
+            if row.measured_quantity.std is None:
                 value_text, std_text = "not identifiable", ""
             else:
-                value_text, std_text = _format_with_std(row.measured.value, row.measured.std)
+                value_text, std_text = _format_with_std(
+                    row.measured_quantity.value, row.measured_quantity.std
+                )
             verdict_text = {True: "DIFFERS", False: "agrees", None: ""}[row.differs]
             table_cells.append(
                 (
@@ -190,14 +197,14 @@ class Proposal:
     def toml(self) -> list[str]:
         """Return lines of TOML that enter the estimates in the profile, section by section."""
         toml_lines: list[str] = []
-        present_section = ""
+        current_section = ""
         for row in self.rows:
-            if row.measured.std is None:
+            if row.measured_quantity.std is None:
                 continue
             row_section = row.key.rpartition(".")[0]
-            if row_section != present_section:
-                present_section = row_section
-                toml_lines += [""] * bool(toml_lines) + [f"[{present_section}]"]
+            if row_section != current_section:
+                current_section = row_section
+                toml_lines += [""] * bool(toml_lines) + [f"[{current_section}]"]
             toml_lines.append(row.toml())
         return toml_lines
 
@@ -207,8 +214,8 @@ class Proposal:
         return {
             "parameters": {
                 row.key: {
-                    "value": row.measured.value,
-                    "std": row.measured.std,
+                    "value": row.measured_quantity.value,
+                    "std": row.measured_quantity.std,
                     "unit": row.unit,
                     "profile": row.profile_value,
                     "source": row.source,
@@ -217,8 +224,8 @@ class Proposal:
                 for row in self.rows
             },
             "torque_scale": {"value": torque_scale.value, "std": torque_scale.std},
-            "passes": self.estimate.windows,
-            "dropped": self.estimate.dropped,
+            "passes": self.estimate.window_count,
+            "dropped": self.estimate.dropped_window_count,
             "misfit": self.estimate.misfit,
             "friction_departure_nm": self.estimate.friction_departure_nm,
             "notes": list(self.notes),
@@ -263,10 +270,10 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
     if rig.cia402 is not None and rig.cia402.rated_torque_unit_nm > 0.0:
         # It converts the drive's own rated torque for the comparison: both change by one factor.
         unit_nm = rig.cia402.rated_torque_unit_nm
-        key = "cia402.rated_torque_unit_nm"
-        compared_numbers.append((key, _scaled(unit_nm, estimate.torque_scale), unit_nm))
-    torque_at_sync = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
-    smallest_values = {"actuation.delay_s": 1 / rig.rate_hz} if torque_at_sync else {}
+        torque_key = "cia402.rated_torque_unit_nm"
+        compared_numbers.append((torque_key, _scaled(unit_nm, estimate.torque_scale), unit_nm))
+    is_torque_at_sync = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
+    smallest_values = {"actuation.delay_s": 1 / rig.rate_hz} if is_torque_at_sync else {}
     proposal_rows = tuple(
         ProposalRow(
             *compared_number,
@@ -276,7 +283,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
         for compared_number in compared_numbers
     )
     operator_notes = _notes(estimate, profile, unusable_count)
-    if any(row.is_below_least for row in proposal_rows if row.key in smallest_values):
+    if any(row.is_below_min_allowed for row in proposal_rows if row.key in smallest_values):
         operator_notes.append(
             "The torque acts before the next SYNC: this drive takes it on arrival, whatever the "
             'type of its RPDO. Set cia402.torque_delivery = "on_arrival" together with the delay.'
@@ -321,12 +328,13 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> li
             "pass): friction is not only viscous and Coulomb, or a delay of the profile is "
             "wrong. The standard deviations include this."
         )
-    omitted_count = unusable_count + estimate.dropped
+    omitted_count = unusable_count + estimate.dropped_window_count
     if omitted_count:
         operator_notes.append(
-            f"{omitted_count} of {omitted_count + estimate.windows} passes were left out: "
+            f"{omitted_count} of {omitted_count + estimate.window_count} passes were left out: "
             f"{unusable_count} with "
-            f"missed ticks or held readings, {estimate.dropped} in which the shaft may have stood "
+            f"missed ticks or held readings, {estimate.dropped_window_count} in which the shaft "
+            "may have stood "
             "still."
         )
     return operator_notes

@@ -9,8 +9,8 @@ import numpy as np
 from rigd.identification.estimate import MotorEstimateError, PassReadings, Timing
 from rigd.identification.experiments import (
     HIGHEST_FREQUENCY_HZ,
-    MULTISINE,
-    SPEEDS,
+    MULTISINE_EXCITATION,
+    SPEEDS_EXCITATION,
     passes_of_schedule,
     read_schedule,
 )
@@ -36,7 +36,7 @@ class Recording:
     """Rate and delays of the readings."""
     tool_inertia_kg_m2: float
     """Inertia between sensor and beam."""
-    unusable: int
+    unusable_pass_count: int
     """Number of passes that were left out for missing, old or clipped readings."""
 
 
@@ -64,23 +64,23 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         files have samples in common.
     """
     pass_readings: list[PassReadings] = []
-    unusable_count = 0
-    first_data: tuple[Timing, float] | None = None
-    digests: dict[Path, frozenset[bytes]] = {}
+    unusable_pass_count = 0
+    first_rig_data: tuple[Timing, float] | None = None
+    digests_by_path: dict[Path, frozenset[bytes]] = {}
     for session_number, session_path in enumerate(paths):
         session = read_session(session_path)
         sample_records = session.samples
         tick_digests = sample_digests(
             sample_records["angle_rad"], sample_records["coupling_torque_nm"]
         )
-        for other_path, other_digest in digests.items():
+        for other_path, other_digest in digests_by_path.items():
             if tick_digests & other_digest:
                 raise MotorEstimateError(
                     f"{session_path}: it has samples of {other_path}, noise included, which "
                     "would count twice; "
                     "give each session once."
                 )
-        digests[session_path] = tick_digests
+        digests_by_path[session_path] = tick_digests
         rig_data = (
             Timing(
                 session.number("rate_hz"),
@@ -90,9 +90,9 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
             ),
             session.number("tool_inertia_kg_m2", 0.0),
         )
-        if first_data is None:
-            first_data = rig_data
-        if rig_data != first_data:
+        if first_rig_data is None:
+            first_rig_data = rig_data
+        if rig_data != first_rig_data:
             raise MotorEstimateError(
                 f"{session_path}: its rate, delays or tool inertia are not those of "
                 f"{paths[0]}; give "
@@ -100,15 +100,17 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
             )
         usable_passes, pass_count = _read_passes(session, session_number, rig_data[0].rate_hz)
         pass_readings += usable_passes
-        unusable_count += pass_count - len(usable_passes)
-    if first_data is None:
+        unusable_pass_count += pass_count - len(usable_passes)
+    if first_rig_data is None:
         raise MotorEstimateError("No session file is given.")
-    if {pass_window.top_hz for pass_window in pass_readings} == {HIGHEST_FREQUENCY_HZ[SPEEDS]}:
+    if {pass_window.highest_frequency_hz for pass_window in pass_readings} == {
+        HIGHEST_FREQUENCY_HZ[SPEEDS_EXCITATION]
+    }:
         raise MotorEstimateError(
             "Constant speeds alone do not determine inertia, delay and torque scale; give the "
-            f"session {MULTISINE} of the same rig, too."
+            f"session {MULTISINE_EXCITATION} of the same rig, too."
         )
-    return Recording(pass_readings, *first_data, unusable_count)
+    return Recording(pass_readings, *first_rig_data, unusable_pass_count)
 
 
 def _read_passes(
@@ -129,10 +131,10 @@ def _read_passes(
     pass_readings = []
     for speed_pass in speed_passes:
         first_index, end_index = np.searchsorted(
-            tick_numbers, (speed_pass.first, speed_pass.end)
+            tick_numbers, (speed_pass.first_tick, speed_pass.end_tick)
         ).tolist()
         if (
-            end_index - first_index < speed_pass.end - speed_pass.first
+            end_index - first_index < speed_pass.end_tick - speed_pass.first_tick
             or is_unusable[first_index:end_index].any()
         ):
             continue
@@ -143,7 +145,7 @@ def _read_passes(
                 torque_command_nm=window_samples["torque_command_nm"],
                 coupling_torque_nm=window_samples["coupling_torque_nm"],
                 speed_rad_s=speed_pass.speed_rad_s,
-                top_hz=HIGHEST_FREQUENCY_HZ[excitation_name],
+                highest_frequency_hz=HIGHEST_FREQUENCY_HZ[excitation_name],
                 session=session_number,
                 key=(session_number, speed_pass.speed_rad_s),
             )

@@ -7,8 +7,9 @@ is constant between commands,
 
 is multiplied by smooth test functions ``w(t) exp(-iωt)`` and integrated by parts, so that no
 reading is differentiated. Each frequency gives a linear equation between moments of the readings
-(`_equations`). All integrals are exact for a command that changes at any moment of a period. The
-measured coupling torque τ_c is the left side of the equations, because it carries the noise.
+(`_motion_equations`). All integrals are exact for a command that changes at any moment of a
+period. The measured coupling torque τ_c is the left side of the equations, because it carries the
+noise.
 
 The equations are solved by weighted least squares (`_fit_equation`). The mean of the repeats is
 fitted, because the loop feeds the noise of a reading back into the command, which would bias a fit
@@ -36,7 +37,7 @@ SCALE_INDEX, INERTIA_INDEX, VISCOUS_INDEX, COULOMB_INDEX, DELAY_INDEX, ZERO_INDE
 
 From `ZERO_INDEX` on, there is one torque offset (zero of the sensor) for each session."""
 
-_RISE_FRACTION = 0.15
+_WINDOW_RISE_FRACTION = 0.15
 """Duration of the rise, and of the fall, of the test functions as a fraction of the window."""
 
 
@@ -64,9 +65,9 @@ class _MotionRepeats:
     """Commanded torque."""
     coupling_torque_nm: RealArray
     """Measured coupling torque."""
-    direction: float
+    speed_sign: float
     """Sign of the speed."""
-    top_hz: float
+    highest_frequency_hz: float
     """Highest frequency of the motion."""
     session: int
     """Index of the session in which the motion was recorded."""
@@ -74,15 +75,15 @@ class _MotionRepeats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _MotionEquations:
-    """Linear equations ``y = x p`` for the unknowns p, one for each repeat and frequency."""
+    """Linear equations of the coupling torque's moments, one for each repeat and frequency."""
 
-    y: ComplexArray
+    torque_moments: ComplexArray
     """Moments of the coupling torque, shape (repeats, frequencies)."""
-    x: ComplexArray
+    unknown_coefficients: ComplexArray
     """Coefficients of the unknowns, shape (repeats, frequencies, unknowns)."""
 
 
-def _equations(
+def _motion_equations(
     motion_repeats: _MotionRepeats,
     timing: Timing,
     delay_s: float,
@@ -97,17 +98,17 @@ def _equations(
     period_s = 1.0 / timing.rate_hz
     repeat_count, n = motion_repeats.angle_rad.shape
     length_s = n * period_s
-    bin_count = int(motion_repeats.top_hz * length_s) + 1
+    bin_count = int(motion_repeats.highest_frequency_hz * length_s) + 1
     omega = 2.0 * pi / length_s * np.arange(bin_count)
-    tick_s: RealArray = np.arange(n, dtype=np.float64) * period_s
+    tick_times_s: RealArray = np.arange(n, dtype=np.float64) * period_s
 
-    def transform(window_weight: RealArray, signal: RealArray, shift_s: float) -> ComplexArray:
+    def transform(window_weight: RealArray, signal: RealArray, time_shift_s: float) -> ComplexArray:
         spectrum = np.fft.rfft(window_weight * signal, axis=-1)[..., :bin_count]
-        shifted_spectrum: ComplexArray = period_s * np.exp(-1j * omega * shift_s) * spectrum
+        shifted_spectrum: ComplexArray = period_s * np.exp(-1j * omega * time_shift_s) * spectrum
         return shifted_spectrum
 
     angle_rad = motion_repeats.angle_rad - motion_repeats.angle_rad.mean(axis=1, keepdims=True)
-    w, w1, w2 = _test_window(tick_s, length_s)
+    w, w1, w2 = _test_window(tick_times_s, length_s)
     angle_0, angle_1, angle_2 = (
         transform(window_weight, angle_rad, 0.0) for window_weight in (w, w1, w2)
     )
@@ -115,29 +116,33 @@ def _equations(
     acceleration_spectrum = angle_2 - 2j * omega * angle_1 - omega**2 * angle_0
     constant_spectrum = np.broadcast_to(transform(w, np.ones(n), 0.0), (repeat_count, bin_count))
 
-    age_s = timing.angle_delay_s - timing.torque_delay_s
-    y = transform(
-        _test_window(tick_s + age_s, length_s)[0], motion_repeats.coupling_torque_nm, age_s
+    relative_angle_age_s = timing.angle_delay_s - timing.torque_delay_s
+    torque_moments = transform(
+        _test_window(tick_times_s + relative_angle_age_s, length_s)[0],
+        motion_repeats.coupling_torque_nm,
+        relative_angle_age_s,
     )
 
     # A command lasts a period: it is integrated over the period around its middle.
-    command_s = delay_s + 0.5 * period_s
-    w, w1, _ = _test_window(tick_s + command_s, length_s)
+    command_middle_s = delay_s + 0.5 * period_s
+    w, w1, _ = _test_window(tick_times_s + command_middle_s, length_s)
     hold_response = np.sinc(omega * period_s / (2.0 * pi))
-    command_spectrum = hold_response * transform(w, motion_repeats.torque_command_nm, command_s)
+    command_spectrum = hold_response * transform(
+        w, motion_repeats.torque_command_nm, command_middle_s
+    )
     delay_slope = (
-        hold_response * transform(w1, motion_repeats.torque_command_nm, command_s)
+        hold_response * transform(w1, motion_repeats.torque_command_nm, command_middle_s)
         - 1j * omega * command_spectrum
     )
 
-    x = np.zeros((repeat_count, bin_count, unknown_count), dtype=complex)
-    x[..., SCALE_INDEX] = command_spectrum
-    x[..., INERTIA_INDEX] = -acceleration_spectrum
-    x[..., VISCOUS_INDEX] = -speed_spectrum
-    x[..., COULOMB_INDEX] = -motion_repeats.direction * constant_spectrum
-    x[..., DELAY_INDEX] = torque_scale * delay_slope
-    x[..., ZERO_INDEX + motion_repeats.session] = -constant_spectrum
-    return _MotionEquations(y, x)
+    unknown_coefficients = np.zeros((repeat_count, bin_count, unknown_count), dtype=complex)
+    unknown_coefficients[..., SCALE_INDEX] = command_spectrum
+    unknown_coefficients[..., INERTIA_INDEX] = -acceleration_spectrum
+    unknown_coefficients[..., VISCOUS_INDEX] = -speed_spectrum
+    unknown_coefficients[..., COULOMB_INDEX] = -motion_repeats.speed_sign * constant_spectrum
+    unknown_coefficients[..., DELAY_INDEX] = torque_scale * delay_slope
+    unknown_coefficients[..., ZERO_INDEX + motion_repeats.session] = -constant_spectrum
+    return _MotionEquations(torque_moments, unknown_coefficients)
 
 
 def _test_window(t: RealArray, length_s: float) -> tuple[RealArray, RealArray, RealArray]:
@@ -145,7 +150,7 @@ def _test_window(t: RealArray, length_s: float) -> tuple[RealArray, RealArray, R
 
     The window is smooth to its third derivative and zero outside of 0 to `length_s`.
     """
-    rise_s = _RISE_FRACTION * length_s
+    rise_s = _WINDOW_RISE_FRACTION * length_s
     edge_distance_s = np.minimum(t, length_s - t)
     x = np.clip(edge_distance_s / rise_s, 0.0, 1.0)
     slope_sign = np.where(t < 0.5 * length_s, 1.0, -1.0)
@@ -157,16 +162,16 @@ def _test_window(t: RealArray, length_s: float) -> tuple[RealArray, RealArray, R
 
 # Weighted least squares
 
-_STD_MARGIN = 1.25
+_STD_WIDENING_FACTOR = 1.25
 """Factor by which all standard deviations are widened.
 
 They are known to some 15 % only, and the model neglects the filter of the readings and the beam's
 part in a jump of torque."""
-_MAX_ITERATIONS = 30
+_MAX_FIT_ITERATIONS = 30
 """Largest number of iterations for delay and weights."""
 _DELAY_TOLERANCE_S = 1e-9
 """Change of the delay in seconds below which the iteration has converged."""
-_LONGEST_DELAY_S = 0.05
+_MAX_COMMAND_DELAY_S = 0.05
 """Largest delay in seconds that the search accepts."""
 _SMOOTHED_BINS = 9
 """Number of neighbouring frequencies over which the noise variance is averaged."""
@@ -188,41 +193,44 @@ class _MotorFit:
 
 
 def _fit_equation(
-    stacks: Sequence[_MotionRepeats], timing: Timing, *, hold_scale: bool
+    stacks: Sequence[_MotionRepeats], timing: Timing, *, fixes_torque_scale: bool
 ) -> _MotorFit | None:
     """Return the weighted fit of the motor's equation to all motions, or None if it diverges.
 
     The fit is iterated for the delay and the weights. Each of `stacks` has at least two repeats.
-    With `hold_scale`, the torque scale is fixed at 1.
+    With `fixes_torque_scale`, the torque scale is fixed at 1.
     """
     unknown_count = ZERO_INDEX + 1 + max(motion_repeats.session for motion_repeats in stacks)
-    is_free = (
+    is_estimated = (
         np.arange(unknown_count) != SCALE_INDEX
-        if hold_scale
+        if fixes_torque_scale
         else np.full(unknown_count, fill_value=True)
     )
     delay_s, torque_scale = timing.actuation_delay_s + timing.angle_delay_s, 1.0
     bin_weights: list[RealArray] = []
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(_MAX_FIT_ITERATIONS):
         stack_equations = [
-            _equations(motion_repeats, timing, delay_s, torque_scale, unknown_count)
+            _motion_equations(motion_repeats, timing, delay_s, torque_scale, unknown_count)
             for motion_repeats in stacks
         ]
         bin_weights = bin_weights or [
-            np.ones(equations.y.shape[1]) for equations in stack_equations
+            np.ones(equations.torque_moments.shape[1]) for equations in stack_equations
         ]
-        solution = _solve_mean_equations(stack_equations, bin_weights, is_free)
-        fit_residuals = [equations.y - equations.x @ solution for equations in stack_equations]
+        solution = _solve_mean_equations(stack_equations, bin_weights, is_estimated)
+        fit_residuals = [
+            equations.torque_moments - equations.unknown_coefficients @ solution
+            for equations in stack_equations
+        ]
         delay_change_s = float(solution[DELAY_INDEX])
         if abs(delay_change_s) < _DELAY_TOLERANCE_S:
             try:
                 return _finish_fit(
-                    stack_equations, bin_weights, fit_residuals, is_free, solution, delay_s
+                    stack_equations, bin_weights, fit_residuals, is_estimated, solution, delay_s
                 )
             except np.linalg.LinAlgError:  # an unknown has no effect in the record
                 return None
         delay_s, torque_scale = delay_s + delay_change_s, float(solution[SCALE_INDEX])
-        if not (abs(delay_s) < _LONGEST_DELAY_S and torque_scale > 0.0):
+        if not (abs(delay_s) < _MAX_COMMAND_DELAY_S and torque_scale > 0.0):
             return None
         bin_weights = _inverse_variances(fit_residuals, stacks)
     return None
@@ -231,28 +239,28 @@ def _fit_equation(
 def _solve_mean_equations(
     stack_equations: Sequence[_MotionEquations],
     weights: Sequence[RealArray],
-    is_free: NDArray[np.bool_],
+    is_estimated: NDArray[np.bool_],
 ) -> RealArray:
     """Return the least-squares solution of the equations, averaged over the repeats of each motion.
 
-    `is_free` is a mask of the unknowns to solve for; the torque scale is 1 if not among them.
+    `is_estimated` is a mask of the unknowns to solve for; the torque scale is 1 if not among them.
     """
-    solution = np.zeros(is_free.size)
+    solution = np.zeros(is_estimated.size)
     solution[SCALE_INDEX] = 1.0
     weighted_blocks, weighted_targets = [], []
     for equations, bin_weights in zip(stack_equations, weights, strict=True):
         weight_root = np.sqrt(bin_weights)
-        x, y = equations.x.mean(axis=0), equations.y.mean(axis=0)
-        if not is_free[SCALE_INDEX]:
+        x, y = equations.unknown_coefficients.mean(axis=0), equations.torque_moments.mean(axis=0)
+        if not is_estimated[SCALE_INDEX]:
             y = y - x[:, SCALE_INDEX]
         weighted_blocks += [
-            weight_root[:, None] * x[:, is_free].real,
-            weight_root[:, None] * x[:, is_free].imag,
+            weight_root[:, None] * x[:, is_estimated].real,
+            weight_root[:, None] * x[:, is_estimated].imag,
         ]
         weighted_targets += [weight_root * y.real, weight_root * y.imag]
     equation_columns = np.concatenate(weighted_blocks)
     column_norms = np.maximum(np.linalg.norm(equation_columns, axis=0), np.finfo(float).tiny)
-    solution[is_free] = (
+    solution[is_estimated] = (
         np.linalg.lstsq(
             equation_columns / column_norms, np.concatenate(weighted_targets), rcond=None
         )[0]
@@ -295,19 +303,19 @@ def _finish_fit(
     stack_equations: Sequence[_MotionEquations],
     weights: Sequence[RealArray],
     residuals: Sequence[ComplexArray],
-    is_free: NDArray[np.bool_],
+    is_estimated: NDArray[np.bool_],
     solution: RealArray,
     delay_s: float,
 ) -> _MotorFit:
     """Remove the bias that the noise causes from the solution, and estimate its uncertainty."""
-    free_indices = np.flatnonzero(is_free)
+    free_indices = np.flatnonzero(is_estimated)
     normal_matrix = np.zeros((free_indices.size, free_indices.size))
     noise_bias = np.zeros(free_indices.size)
     for equations, bin_weight, bin_residuals in zip(
         stack_equations, weights, residuals, strict=True
     ):
-        repeat_count = len(equations.y)
-        x = equations.x[..., free_indices]
+        repeat_count = len(equations.torque_moments)
+        x = equations.unknown_coefficients[..., free_indices]
         mean_equation = x.mean(axis=0)
         normal_matrix += np.einsum(
             "mp,m,mq->pq", mean_equation.conj(), bin_weight, mean_equation
@@ -326,8 +334,8 @@ def _finish_fit(
     for equations, bin_weight, bin_residuals in zip(
         stack_equations, weights, residuals, strict=True
     ):
-        repeat_count = len(equations.y)
-        mean_equation = equations.x[..., free_indices].mean(axis=0)
+        repeat_count = len(equations.torque_moments)
+        mean_equation = equations.unknown_coefficients[..., free_indices].mean(axis=0)
         noise_effects = (
             np.einsum("mp,m,rm->rp", mean_equation.conj(), bin_weight, bin_residuals).real
             @ inverse_matrix
@@ -337,7 +345,7 @@ def _finish_fit(
         mean_residual = bin_residuals.mean(axis=0)
         weighted_squares += float(np.sum(bin_weight * np.abs(mean_residual) ** 2))
         term_count += mean_residual.size
-        constant_column = abs(equations.x[0, 0, COULOMB_INDEX])
+        constant_column = abs(equations.unknown_coefficients[0, 0, COULOMB_INDEX])
         friction_departure_nm = max(
             friction_departure_nm, abs(float(mean_residual[0].real)) / float(constant_column)
         )
@@ -347,12 +355,14 @@ def _finish_fit(
         stack_variances**2 / np.array(stack_degrees_of_freedom)[:, None], axis=0
     )
     misfit = weighted_squares / max(1.0, term_count - 0.5 * free_indices.size)
-    widening = _STD_MARGIN * _student_factor(degrees_of_freedom) * sqrt(max(1.0, misfit))
+    std_widening = (
+        _STD_WIDENING_FACTOR * _student_factor(degrees_of_freedom) * sqrt(max(1.0, misfit))
+    )
 
-    unbiased_values, stds = solution.copy(), np.zeros(is_free.size)
+    unbiased_values, stds = solution.copy(), np.zeros(is_estimated.size)
     unbiased_values[free_indices] -= inverse_matrix @ noise_bias
     unbiased_values[DELAY_INDEX] += delay_s
-    stds[free_indices] = widening * np.sqrt(unknown_variances)
+    stds[free_indices] = std_widening * np.sqrt(unknown_variances)
     return _MotorFit(unbiased_values, stds, misfit, friction_departure_nm)
 
 
@@ -373,9 +383,9 @@ _MIN_SPEED_FRACTION = 0.1
 """Fraction of the nominal speed below which the shaft may have stood still."""
 _HALF_SPEED_WINDOW_S = 0.01
 """Half the time in seconds over which the shaft's speed is measured to detect a standstill."""
-_MAX_SCALE_STD = 0.05
+_MAX_TORQUE_SCALE_STD = 0.05
 """Largest standard deviation of an accepted torque scale: the accuracy of a datasheet's value."""
-_PLAUSIBLE_SCALES = (0.5, 2.0)
+_PLAUSIBLE_TORQUE_SCALES = (0.5, 2.0)
 """Smallest and largest plausible torque scale.
 
 Without a beam, a scale of 0 with no inertia and no friction solves the equation, too."""
@@ -397,7 +407,7 @@ class PassReadings:
     """Measured torque between motor and beam."""
     speed_rad_s: float
     """Nominal speed of the pass, with its sign."""
-    top_hz: float
+    highest_frequency_hz: float
     """Highest frequency of the motion."""
     session: int
     """Number of the session, since each session has its own zero of the torque."""
@@ -432,9 +442,9 @@ class MotorEstimate:
     relative to the torque as the drive states it."""
     actuation_delay_s: MotorQuantity
     """Delay from the command to the torque."""
-    windows: int
+    window_count: int
     """Number of windows in which the shaft never stood still."""
-    dropped: int
+    dropped_window_count: int
     """Number of windows that were dropped because the shaft may have stood still."""
     misfit: float
     """Ratio of the residual's mean square to that expected from scatter; 1 if the equation holds.
@@ -478,21 +488,23 @@ def estimate_motor(
         if _moves_throughout(pass_readings, timing.rate_hz)
     ]
     repeat_stacks = _group_repeats(moving_windows, len(windows))
-    fit = _fit_equation(repeat_stacks, timing, hold_scale=False)
+    motor_fit = _fit_equation(repeat_stacks, timing, fixes_torque_scale=False)
     is_scale_known = (
-        fit is not None
-        and fit.stds[SCALE_INDEX] < _MAX_SCALE_STD
-        and _PLAUSIBLE_SCALES[0] < fit.values[SCALE_INDEX] < _PLAUSIBLE_SCALES[1]
+        motor_fit is not None
+        and motor_fit.stds[SCALE_INDEX] < _MAX_TORQUE_SCALE_STD
+        and _PLAUSIBLE_TORQUE_SCALES[0]
+        < motor_fit.values[SCALE_INDEX]
+        < _PLAUSIBLE_TORQUE_SCALES[1]
     )
     if not is_scale_known:
-        fit = _fit_equation(repeat_stacks, timing, hold_scale=True)
-    if fit is None:
+        motor_fit = _fit_equation(repeat_stacks, timing, fixes_torque_scale=True)
+    if motor_fit is None:
         raise MotorEstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
             "Check actuation.delay_s of the profile, from which the search begins, and the "
             "record."
         )
-    fitted_values, stds = fit.values, fit.stds
+    fitted_values, stds = motor_fit.values, motor_fit.stds
     inertia_kg_m2 = float(fitted_values[INERTIA_INDEX])
     if inertia_kg_m2 <= 0.0:
         raise MotorEstimateError(
@@ -501,7 +513,7 @@ def estimate_motor(
             "motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
         )
     torque_jump_fraction = tool_inertia_kg_m2 / (inertia_kg_m2 + tool_inertia_kg_m2)
-    jump_std_s = torque_jump_fraction / timing.rate_hz / sqrt(12.0)
+    jump_instant_std_s = torque_jump_fraction / timing.rate_hz / sqrt(12.0)
     return MotorEstimate(
         inertia_kg_m2=MotorQuantity(inertia_kg_m2, float(stds[INERTIA_INDEX])),
         viscous_nm_s_per_rad=MotorQuantity(
@@ -513,21 +525,23 @@ def estimate_motor(
         ),
         actuation_delay_s=MotorQuantity(
             float(fitted_values[DELAY_INDEX]) - timing.angle_delay_s,
-            sqrt(float(stds[DELAY_INDEX]) ** 2 + jump_std_s**2),
+            sqrt(float(stds[DELAY_INDEX]) ** 2 + jump_instant_std_s**2),
         ),
-        windows=len(moving_windows),
-        dropped=len(windows) - len(moving_windows),
-        misfit=fit.misfit,
-        friction_departure_nm=fit.friction_departure_nm,
+        window_count=len(moving_windows),
+        dropped_window_count=len(windows) - len(moving_windows),
+        misfit=motor_fit.misfit,
+        friction_departure_nm=motor_fit.friction_departure_nm,
     )
 
 
 def _moves_throughout(pass_readings: PassReadings, rate_hz: float) -> bool:
     """Return whether the shaft moves in the nominal direction during the whole window."""
-    half_ticks = max(1, round(_HALF_SPEED_WINDOW_S * rate_hz))
+    half_window_ticks = max(1, round(_HALF_SPEED_WINDOW_S * rate_hz))
     angle_rad = pass_readings.angle_rad
     speed_rad_s = (
-        (angle_rad[2 * half_ticks :] - angle_rad[: -2 * half_ticks]) * rate_hz / (2 * half_ticks)
+        (angle_rad[2 * half_window_ticks :] - angle_rad[: -2 * half_window_ticks])
+        * rate_hz
+        / (2 * half_window_ticks)
     )
     forward_speed_rad_s = speed_rad_s * np.sign(pass_readings.speed_rad_s)
     return bool(np.min(forward_speed_rad_s) > _MIN_SPEED_FRACTION * abs(pass_readings.speed_rad_s))
@@ -538,18 +552,20 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
 
     `window_count` is the number of windows before those with a standstill were removed.
     """
-    window_groups: dict[Hashable, list[PassReadings]] = {}
+    windows_by_motion: dict[Hashable, list[PassReadings]] = {}
     for pass_readings in windows:
-        window_groups.setdefault(pass_readings.key, []).append(pass_readings)
+        windows_by_motion.setdefault(pass_readings.key, []).append(pass_readings)
     complete_groups = [
-        repeat_group for repeat_group in window_groups.values() if len(repeat_group) >= MIN_REPEATS
+        repeat_group
+        for repeat_group in windows_by_motion.values()
+        if len(repeat_group) >= MIN_REPEATS
     ]
     if {np.sign(repeat_group[0].speed_rad_s) for repeat_group in complete_groups} != {1.0, -1.0}:
         raise MotorEstimateError(
             f"Too few passes: {len(windows)} of {window_count} have neither gaps nor a standstill, "
             f"but an estimate takes at least {MIN_REPEATS} of the same kind in each direction."
         )
-    session_indices = {
+    session_index_by_number = {
         session_number: session_index
         for session_index, session_number in enumerate(
             sorted({repeat_group[0].session for repeat_group in complete_groups})
@@ -561,8 +577,8 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
             np.array([pass_readings.torque_command_nm for pass_readings in repeat_group]),
             np.array([pass_readings.coupling_torque_nm for pass_readings in repeat_group]),
             float(np.sign(repeat_group[0].speed_rad_s)),
-            repeat_group[0].top_hz,
-            session_indices[repeat_group[0].session],
+            repeat_group[0].highest_frequency_hz,
+            session_index_by_number[repeat_group[0].session],
         )
         for repeat_group in complete_groups
     ]

@@ -21,34 +21,34 @@ from rigd.profile import Profile
 
 RealArray = NDArray[np.float64]
 
-TRIAL = "motor-trial"
+TRIAL_EXCITATION = "motor-trial"
 """Name of the excitation of the short session that precedes the other sessions."""
-MULTISINE = "motor-multisine"
+MULTISINE_EXCITATION = "motor-multisine"
 """Name of the excitation with a multisine on fast passes."""
-SPEEDS = "motor-speeds"
+SPEEDS_EXCITATION = "motor-speeds"
 """Name of the excitation with passes at four constant speeds."""
 
-HIGHEST_FREQUENCY_HZ = {TRIAL: 33.0, MULTISINE: 33.0, SPEEDS: 3.4}
+HIGHEST_FREQUENCY_HZ = {TRIAL_EXCITATION: 33.0, MULTISINE_EXCITATION: 33.0, SPEEDS_EXCITATION: 3.4}
 """Highest frequency in Hz of the shaft's or the beam's motion, by the name of the excitation."""
 
-_MAX_SPEED_RAD_S = 1.0
+_MAX_PASS_SPEED_RAD_S = 1.0
 """Largest speed of a pass in rad/s."""
 _SPEED_LIMIT_FRACTION = 0.5
 """Largest speed of a pass as a fraction of the profile's speed limit.
 
 The remainder is reserved for the multisine and for errors of the motor's data."""
-_STROKE_FRACTION = 0.93
+_USED_STROKE_FRACTION = 0.93
 """Fraction of the stroke that the passes use.
 
 The remainder is reserved for multisine, offsets and overshoot."""
-_RELATIVE_SPEEDS = (0.1, 0.3, 0.6, 1.0)
-"""Speeds of the passes of the excitation `SPEEDS`, relative to the fastest pass."""
-_SPEED_MODULATION = {TRIAL: 0.2, MULTISINE: 0.5}
+_RELATIVE_PASS_SPEEDS = (0.1, 0.3, 0.6, 1.0)
+"""Speeds of the passes of the excitation `SPEEDS_EXCITATION`, relative to the fastest pass."""
+_SPEED_MODULATION = {TRIAL_EXCITATION: 0.2, MULTISINE_EXCITATION: 0.5}
 """Largest change of a pass's speed by the multisine, as a fraction, for each excitation.
 
 It is small in the trial, in which the motor's data are uncertain: the speed must not reverse even
 if the inertia is a quarter of that stated in the profile."""
-_CYCLE_COUNTS = {TRIAL: 6, MULTISINE: 16, SPEEDS: 5}
+_CYCLE_COUNTS = {TRIAL_EXCITATION: 6, MULTISINE_EXCITATION: 16, SPEEDS_EXCITATION: 5}
 """Number of cycles of passes for each excitation."""
 _MULTISINE_BAND_HZ = (1.6, 32.0)
 """Lowest and highest frequency of the multisine in Hz.
@@ -58,7 +58,7 @@ so that the scale of the motor's torque is identifiable. Above 32 Hz, the encode
 acceleration."""
 _MIN_MULTISINE_FRACTION = 0.1
 """Smallest accepted factor by which the multisine is reduced to respect the torque limit."""
-_OFFSET_STEPS = 40.0
+_OFFSET_RANGE_ENCODER_STEPS = 40.0
 """Range of the offsets of the cycles, in encoder steps.
 
 It is so large that the encoder's rounding errors do not repeat from cycle to cycle."""
@@ -95,13 +95,13 @@ class PassSchedule:
 class SpeedPass:
     """Evaluated window of a pass at constant nominal speed."""
 
-    first: int
+    first_tick: int
     """First tick of the window."""
-    end: int
+    end_tick: int
     """Tick after the last one of the window."""
     speed_rad_s: float
     """Nominal speed of the pass, with its sign."""
-    cycle: int
+    cycle_index: int
     """Index of the pass's cycle, from 0."""
 
 
@@ -147,7 +147,7 @@ def trial_session(profile: Profile, *, torque_percent: float, stroke_rad: float)
     torque_percent, stroke_rad
         Limits of torque and angle as for `multisine_session`.
     """
-    return _multisine_excitation(TRIAL, profile, torque_percent, stroke_rad)
+    return _multisine_excitation(TRIAL_EXCITATION, profile, torque_percent, stroke_rad)
 
 
 def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
@@ -172,39 +172,45 @@ def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: fl
     ControlDesignError
         If the profile's loop cannot be closed.
     """
-    return _multisine_excitation(MULTISINE, profile, torque_percent, stroke_rad)
+    return _multisine_excitation(MULTISINE_EXCITATION, profile, torque_percent, stroke_rad)
 
 
 def _multisine_excitation(
     excitation_name: str, profile: Profile, torque_percent: float, stroke_rad: float
 ) -> Excitation:
-    """Return the excitation `TRIAL` or `MULTISINE`: passes with a multisine."""
-    allowed_nm = _torque_limit(profile, torque_percent)
+    """Return the excitation of the trial or of the multisine: passes with a multisine."""
+    allowed_torque_nm = _torque_limit(profile, torque_percent)
     closed_loop = close_loop(profile.loop_model())
     pass_schedule = _fit_schedule(excitation_name, (1.0,), profile, stroke_rad)
-    passes_rad = _passes_reference(pass_schedule, profile)
+    passes_reference_rad = _passes_reference(pass_schedule, profile)
     multisine_rad = _multisine_reference(
         pass_schedule, closed_loop, _SPEED_MODULATION[excitation_name]
     )
-    passes_peak_nm = _peak_torque(closed_loop, passes_rad)
-    peak_nm = _peak_torque(closed_loop, passes_rad + multisine_rad)
+    passes_peak_torque_nm = _peak_torque(closed_loop, passes_reference_rad)
+    peak_torque_nm = _peak_torque(closed_loop, passes_reference_rad + multisine_rad)
     multisine_fraction = 1.0
-    if peak_nm > allowed_nm:
+    if peak_torque_nm > allowed_torque_nm:
         # The peak is a convex function of the fraction, below the straight line between the two.
-        multisine_fraction = (allowed_nm - passes_peak_nm) / (peak_nm - passes_peak_nm)
+        multisine_fraction = (allowed_torque_nm - passes_peak_torque_nm) / (
+            peak_torque_nm - passes_peak_torque_nm
+        )
     if multisine_fraction < _MIN_MULTISINE_FRACTION:
-        sufficient_torque_nm = passes_peak_nm + _MIN_MULTISINE_FRACTION * (peak_nm - passes_peak_nm)
+        sufficient_torque_nm = passes_peak_torque_nm + _MIN_MULTISINE_FRACTION * (
+            peak_torque_nm - passes_peak_torque_nm
+        )
         raise ExcitationError(
-            f"--torque-percent {torque_percent:g}: of {allowed_nm:.3g} N·m the passes alone take "
-            f"{passes_peak_nm:.3g} N·m, and too little is left for the multisine; allow at least "
-            f"{_rounded_percent(profile, sufficient_torque_nm)} % or a shorter --stroke-rad."
+            f"--torque-percent {torque_percent:g}: of {allowed_torque_nm:.3g} N·m the passes "
+            "alone take "
+            f"{passes_peak_torque_nm:.3g} N·m, and too little is left for the multisine; allow "
+            "at least "
+            f"{_rounded_torque_percent(profile, sufficient_torque_nm)} % or a shorter --stroke-rad."
         )
     return _checked_excitation(
         excitation_name,
         pass_schedule,
         profile,
         closed_loop,
-        passes_rad + multisine_fraction * multisine_rad,
+        passes_reference_rad + multisine_fraction * multisine_rad,
         torque_percent,
         stroke_rad,
     )
@@ -227,19 +233,26 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
     ControlDesignError
         If the profile's loop cannot be closed.
     """
-    limit_nm = _torque_limit(profile, torque_percent)
+    torque_limit_nm = _torque_limit(profile, torque_percent)
     closed_loop = close_loop(profile.loop_model())
-    pass_schedule = _fit_schedule(SPEEDS, _RELATIVE_SPEEDS, profile, stroke_rad)
+    pass_schedule = _fit_schedule(SPEEDS_EXCITATION, _RELATIVE_PASS_SPEEDS, profile, stroke_rad)
     reference_rad = _passes_reference(pass_schedule, profile)
-    peak_nm = _peak_torque(closed_loop, reference_rad)
-    if peak_nm > limit_nm:
+    peak_torque_nm = _peak_torque(closed_loop, reference_rad)
+    if peak_torque_nm > torque_limit_nm:
         raise ExcitationError(
-            f"--torque-percent {torque_percent:g}: the turns take {peak_nm:.3g} N·m and only "
-            f"{limit_nm:.3g} N·m are allowed; allow at least "
-            f"{_rounded_percent(profile, peak_nm)} % or a shorter --stroke-rad."
+            f"--torque-percent {torque_percent:g}: the turns take {peak_torque_nm:.3g} N·m and "
+            "only "
+            f"{torque_limit_nm:.3g} N·m are allowed; allow at least "
+            f"{_rounded_torque_percent(profile, peak_torque_nm)} % or a shorter --stroke-rad."
         )
     return _checked_excitation(
-        SPEEDS, pass_schedule, profile, closed_loop, reference_rad, torque_percent, stroke_rad
+        SPEEDS_EXCITATION,
+        pass_schedule,
+        profile,
+        closed_loop,
+        reference_rad,
+        torque_percent,
+        stroke_rad,
     )
 
 
@@ -269,7 +282,7 @@ def _torque_limit(profile: Profile, torque_percent: float) -> float:
     return torque_percent / 100 * profile.rig.motor.rated_torque_nm
 
 
-def _rounded_percent(profile: Profile, torque_nm: float) -> int:
+def _rounded_torque_percent(profile: Profile, torque_nm: float) -> int:
     """Return a torque plus a margin of 1 %, in percent of the rated torque, rounded up."""
     return ceil(101 * torque_nm / profile.rig.motor.rated_torque_nm)
 
@@ -291,13 +304,14 @@ def _fit_schedule(
     travel_per_speed_s = float(
         np.ptp(_passes_path(PassSchedule(relative_speeds, 1), profile.rig.rate_hz))
     )
-    fastest_rad_s = min(
-        _MAX_SPEED_RAD_S,
+    max_pass_speed_rad_s = min(
+        _MAX_PASS_SPEED_RAD_S,
         _SPEED_LIMIT_FRACTION * limits.velocity_rad_s,
-        2 * _STROKE_FRACTION * stroke_rad / travel_per_speed_s,
+        2 * _USED_STROKE_FRACTION * stroke_rad / travel_per_speed_s,
     )
     return PassSchedule(
-        tuple(relative_speed * fastest_rad_s for relative_speed in relative_speeds), cycle_count
+        tuple(relative_speed * max_pass_speed_rad_s for relative_speed in relative_speeds),
+        cycle_count,
     )
 
 
@@ -345,21 +359,21 @@ def _add_offsets(reference_rad: RealArray, schedule: PassSchedule, profile: Prof
     """
     rate_hz = profile.rig.rate_hz
     turn_ticks = round(schedule.turn_s * rate_hz)
-    previous_first = round((schedule.turn_s + schedule.settle_s) * rate_hz)
+    ticks_before_window = round((schedule.turn_s + schedule.settle_s) * rate_hz)
     offset_rise = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
     offset_rad = 0.0
     last_cycle = -1
     for speed_pass in passes_of_schedule(schedule, rate_hz):
-        if speed_pass.cycle == last_cycle:
+        if speed_pass.cycle_index == last_cycle:
             continue
-        last_cycle = speed_pass.cycle
+        last_cycle = speed_pass.cycle_index
         cycle_fraction = _GOLDEN_FRACTION * (last_cycle + 1)
         next_offset_rad = (
-            _OFFSET_STEPS
+            _OFFSET_RANGE_ENCODER_STEPS
             * profile.rig.encoder.resolution_rad
             * (cycle_fraction - floor(cycle_fraction) - 0.5)
         )
-        first_sample = speed_pass.first - previous_first
+        first_sample = speed_pass.first_tick - ticks_before_window
         reference_rad[first_sample : first_sample + turn_ticks] += (
             next_offset_rad - offset_rad
         ) * offset_rise
@@ -368,12 +382,12 @@ def _add_offsets(reference_rad: RealArray, schedule: PassSchedule, profile: Prof
 
 
 def _multisine_reference(
-    schedule: PassSchedule, closed_loop: ClosedLoop, modulation: float
+    schedule: PassSchedule, closed_loop: ClosedLoop, speed_modulation: float
 ) -> RealArray:
     """Return the reference angle in rad of the multisine alone.
 
     In response to it, the loop changes the speed of the passes by at most the fraction
-    `modulation`.
+    `speed_modulation`.
     """
     rate_hz = closed_loop.model.rate_hz
     window_ticks = round(schedule.window_s * rate_hz)
@@ -391,7 +405,7 @@ def _multisine_reference(
     speed_spectrum = np.zeros(window_ticks // 2 + 1, dtype=complex)
     speed_spectrum[harmonic_numbers] = np.exp(1j * phases_rad)
     peak_speed = float(np.max(np.abs(np.fft.irfft(speed_spectrum, window_ticks))))
-    speed_spectrum *= modulation * schedule.speeds_rad_s[0] / peak_speed
+    speed_spectrum *= speed_modulation * schedule.speeds_rad_s[0] / peak_speed
     reference_spectrum = np.zeros_like(speed_spectrum)
     reference_spectrum[harmonic_numbers] = (
         speed_spectrum[harmonic_numbers]
@@ -411,10 +425,10 @@ def _multisine_reference(
         * envelope_samples
     )
     speed_passes = passes_of_schedule(schedule, rate_hz)
-    sample_count = speed_passes[-1].end + turn_ticks + round(schedule.end_s * rate_hz)
+    sample_count = speed_passes[-1].end_tick + turn_ticks + round(schedule.end_s * rate_hz)
     reference_rad = np.zeros(sample_count)
     for speed_pass in speed_passes:
-        first_sample = speed_pass.first - settle_ticks - half_turn_ticks
+        first_sample = speed_pass.first_tick - settle_ticks - half_turn_ticks
         reference_rad[first_sample : first_sample + windowed_rad.size] += windowed_rad
     return reference_rad
 
@@ -442,10 +456,11 @@ def _checked_excitation(
     stroke_rad: float,
 ) -> Excitation:
     """Return an excitation; raise ExcitationError if the angle predicted for it is too large."""
-    peak_rad = float(np.max(np.abs(closed_loop.simulate(reference_rad).angle_rad)))
-    if peak_rad > stroke_rad:
+    peak_angle_rad = float(np.max(np.abs(closed_loop.simulate(reference_rad).angle_rad)))
+    if peak_angle_rad > stroke_rad:
         raise ExcitationError(
-            f"--stroke-rad {stroke_rad:g}: the predicted peak angle is {peak_rad:.3g} rad; allow "
+            f"--stroke-rad {stroke_rad:g}: the predicted peak angle is {peak_angle_rad:.3g} "
+            "rad; allow "
             "more."
         )
     rate_hz = profile.rig.rate_hz

@@ -20,7 +20,7 @@ from rigd.errors import RigdError
 from rigd.estimates import Estimate
 from rigd.excitation import (
     BAND_HZ,
-    PAUSE_S,
+    SEGMENT_PAUSE_S,
     SHORTEST_SEGMENT_S,
     BeamEstimate,
     PrecisionSearch,
@@ -159,7 +159,7 @@ def _target_estimate(target: Target, estimate: Estimate | None) -> TargetEstimat
         *quantity_and_mode,
         estimate.value,
         inf if estimate.flag or estimate.std is None else estimate.std,
-        target.std * (relative_scale if target.relative else 1.0),
+        target.std * (relative_scale if target.is_relative else 1.0),
         estimate.flag or "",
     )
 
@@ -377,11 +377,11 @@ class ExcitationPlanner:
         # Negative if the angle was held for a long time before the last segment.
         remaining_ticks = self._max_ticks - reference_rad.size
         remaining_s = remaining_ticks / self._rate_hz
-        if remaining_s < SHORTEST_SEGMENT_S + PAUSE_S:
+        if remaining_s < SHORTEST_SEGMENT_S + SEGMENT_PAUSE_S:
             if self.may_be_last or remaining_ticks <= 0:
                 yield self._search_end_message(self._not_reached_text, is_reached=False)
             else:
-                self._append_pause(min(PAUSE_S, remaining_s))
+                self._append_pause(min(SEGMENT_PAUSE_S, remaining_s))
             return
         move_plant = self._preview.plant_with(estimate.plant)
         angle_rad = move_plant.respond(reference_rad).angle_rad
@@ -390,21 +390,21 @@ class ExcitationPlanner:
             angle_rad,
             self._corrected_targets(estimate, angle_rad[:record_tick], estimates),
             self._preview,
-            remaining_s - PAUSE_S,
+            remaining_s - SEGMENT_PAUSE_S,
             tip_slope_rad=_TIP_SLOPE_FRACTION * self._tip_slope_rad,
-            through=self._modes_to_excite(estimates),
+            modes_to_drive=self._modes_to_excite(estimates),
             limit_fraction=amplitude_fraction,
         )
         if not self.may_be_last and all(
             target_forecast.ratio <= _SUFFICIENT_STD_RATIO
             for target_forecast in next_planned_segment.present_precisions
         ):
-            self._append_pause(PAUSE_S)
+            self._append_pause(SEGMENT_PAUSE_S)
             return
         impossible_reasons = [
-            f"{target_forecast.impossible}."
+            f"{target_forecast.impossible_reason}."
             for target_forecast in next_planned_segment.present_precisions
-            if target_forecast.impossible
+            if target_forecast.impossible_reason
         ]
         # Two forecasts: from the information of possible segments, and from the progress so far.
         is_too_slow = (

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS, Plant
-from rigd.identified_beam import TOUCH, read_identified_beam
+from rigd.identified_beam import TOUCH_USE, read_identified_beam
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 _ASSUMED_RELATIVE_STD: Final = {
@@ -121,7 +121,7 @@ class TouchModel:
             If the file cannot be read, lacks the beam's stiffness or density, has an effect that a
             uniform beam on a rigid clamp does not have, or marks a required number as doubtful.
         """
-        identified = read_identified_beam(path, stated_plant, TOUCH)
+        identified = read_identified_beam(path, stated_plant, TOUCH_USE)
         return cls(
             identified.plant,
             angle_delay_s,

@@ -25,9 +25,9 @@ def one_pass(first):
     """Rest of 200 ticks, way out at 1 rad/s, pause of 300, way back."""
     out = np.arange(1, OUT_TICKS + 1) / RATE_HZ
     reference = np.concatenate([np.zeros(200), out, np.full(300, out[-1]), out[-1] * (1 - BACK)])
-    begins = first + 200
-    returns = begins + OUT_TICKS + 300
-    return reference, TouchPass(begins, returns, first + reference.size)
+    begin_tick = first + 200
+    return_tick = begin_tick + OUT_TICKS + 300
+    return reference, TouchPass(begin_tick, return_tick, first + reference.size)
 
 
 class ScriptedDetector:
@@ -96,11 +96,11 @@ def run(search, until=None):
 def test_the_reference_is_unchanged_without_a_touch(search):
     assert run(search) == {}
     assert np.array_equal(search.reference, search.planned)
-    assert search.detector.armed_at == [search.one.begins, search.two.begins]
+    assert search.detector.armed_at == [search.one.begin_tick, search.two.begin_tick]
 
 
 def test_the_motor_brakes_holds_and_returns_after_a_touch(search):
-    tick = search.one.begins + 300
+    tick = search.one.begin_tick + 300
     search.detector.at = {tick}
     contacts = run(search, tick + 1)
     assert search.cycle.flags & Status.TOUCHED
@@ -116,28 +116,32 @@ def test_the_motor_brakes_holds_and_returns_after_a_touch(search):
     assert np.ptp(held_rad) == 0.0
     assert held_rad[0] == pytest.approx(reference[tick] + 0.5 * BRAKING.duration_s, abs=1e-3)
     assert reference[tick + 200 + BACK.size] == pytest.approx(0.0)
-    assert not reference[tick + 200 + BACK.size : search.two.begins].any()
-    assert np.array_equal(reference[search.one.ends :], search.planned[search.one.ends :])
+    assert not reference[tick + 200 + BACK.size : search.two.begin_tick].any()
+    assert np.array_equal(reference[search.one.end_tick :], search.planned[search.one.end_tick :])
 
 
 def test_the_detector_is_armed_again_in_the_next_pass(search):
-    search.detector.at = {search.one.begins + 100, search.one.ends + 50, search.two.begins + 100}
+    search.detector.at = {
+        search.one.begin_tick + 100,
+        search.one.end_tick + 50,
+        search.two.begin_tick + 100,
+    }
     contacts = run(search)
-    assert list(contacts) == [search.one.begins + 100, search.two.begins + 100]
-    assert search.detector.armed_at == [search.one.begins, search.two.begins]
+    assert list(contacts) == [search.one.begin_tick + 100, search.two.begin_tick + 100]
+    assert search.detector.armed_at == [search.one.begin_tick, search.two.begin_tick]
 
 
 def test_the_motor_stays_after_a_touch_in_the_pause(search):
-    tick = search.one.returns - 10
+    tick = search.one.return_tick - 10
     search.detector.at = {tick}
     run(search, tick + 1)
     reference = np.array(search.reference)
-    assert np.allclose(reference[tick + 1 : search.one.returns], search.planned[tick])
-    assert reference[search.one.ends - 1] == pytest.approx(0.0)
+    assert np.allclose(reference[tick + 1 : search.one.return_tick], search.planned[tick])
+    assert reference[search.one.end_tick - 1] == pytest.approx(0.0)
 
 
 def test_a_touch_on_the_way_back_stops_the_session(search):
-    tick = search.one.returns + 20
+    tick = search.one.return_tick + 20
     search.detector.at = {tick}
     (contact,) = run(search).values()
     assert contact.session_outcome == "stopped"
@@ -146,7 +150,7 @@ def test_a_touch_on_the_way_back_stops_the_session(search):
 
 
 def test_an_excessive_force_is_a_fault(search):
-    tick = search.one.begins + 50
+    tick = search.one.begin_tick + 50
     search.detector.force_n = {tick - 20: -6.0, tick: -6.0, tick + 1: -6.0}
     contacts = run(search)
     assert list(contacts) == [tick + 1]
@@ -170,11 +174,11 @@ def test_the_detector_receives_all_readings(search):
 def test_the_path_after_a_touch_is_smooth(tick, speed, hold):
     approach = Approach((), BRAKING, hold, BACK, 1.0)
     recent = tuple(0.3 + speed * k / RATE_HZ for k in (-2, -1, 0))
-    ends = 1000 + BACK.size
-    path = reference_after_touch(approach, ends, tick, recent, -0.2)
-    assert path.shape == (ends - tick - 1,)
+    end_tick = 1000 + BACK.size
+    path = reference_after_touch(approach, end_tick, tick, recent, -0.2)
+    assert path.shape == (end_tick - tick - 1,)
     assert path[-1] == pytest.approx(-0.2)
-    if ends - tick - 1 - BACK.size < 50:
+    if end_tick - tick - 1 - BACK.size < 50:
         return  # too late to brake: the motor was at rest in the pause already
     whole = np.concatenate([recent, path])
     jump = np.abs(np.diff(whole, 2)).max() * RATE_HZ**2

@@ -155,7 +155,7 @@ def test_only_the_requested_mode_is_driven(rig):
 
 def test_required_mode_is_driven_first(rig, scanned):
     def driven(*through):
-        name = next_segment(ESTIMATE, scanned, DAMPING, rig, 3.0, through=through).name
+        name = next_segment(ESTIMATE, scanned, DAMPING, rig, 3.0, modes_to_drive=through).name
         return set(name.partition(",")[0].split())
 
     others = {"1", "2", "3"} - driven()

@@ -10,7 +10,7 @@ from cases import further
 from rigd.beam import clamped_free_eigenvalues
 from rigd.excitation import KINDS, ExcitationError, move
 from rigd.excitation.moves import modal_state
-from rigd.identified_beam import MOVE, IdentifiedBeamError
+from rigd.identified_beam import MOVE_USE, IdentifiedBeamError
 from rigd.profile import load_profile
 from rigd.runner import Series
 from rigd.runner.planning import (
@@ -41,9 +41,9 @@ def test_the_move_is_planned_for_the_beam_of_the_analysis(analysed, profile):
     stiffer = RigPreview(profile).move_plant(
         analysed(bending_stiffness_n_m2={"value": stiffness, "std": 0.0},
                  density_over_stiffness={"value": 4.7e-3 / stiffness, "std": 0.0}),
-        MOVE,
+        MOVE_USE,
     )  # fmt: skip
-    stated = RigPreview(profile).move_plant("", MOVE)
+    stated = RigPreview(profile).move_plant("", MOVE_USE)
     ratio = abs(stiffer.poles_rad_s[0]) / abs(stated.poles_rad_s[0])
     assert ratio == pytest.approx(1.2**0.5, rel=1e-2)
 
@@ -165,7 +165,7 @@ OFFSETS = {"stiffness_offset_2": {"value": -0.1}, "stiffness_offset_3": {"value"
 
 @pytest.mark.parametrize("effect", [TIP_MASS, COMPLIANCE, OFFSETS])
 def test_poles_of_a_move_are_those_of_the_identified_beam(profile, analysed, effect):
-    plant = RigPreview(profile).move_plant(analysed(**effect), MOVE)
+    plant = RigPreview(profile).move_plant(analysed(**effect), MOVE_USE)
     assert plant.model is not None
     locked = plant.model.plant.poles(clamped_free_eigenvalues(3))[:, 0]
     assert plant.poles_rad_s[:3] == pytest.approx(locked, rel=5e-3)
@@ -173,7 +173,7 @@ def test_poles_of_a_move_are_those_of_the_identified_beam(profile, analysed, eff
 
 @pytest.mark.parametrize("effect", [further(TIP_MASS), further(COMPLIANCE), OFFSETS])
 def test_move_of_the_identified_beam_leaves_no_vibration(profile, analysed, effect):
-    plant = RigPreview(profile).move_plant(analysed(**effect), MOVE)
+    plant = RigPreview(profile).move_plant(analysed(**effect), MOVE_USE)
     made = excitation_for(profile, "move", {"by_rad": 0.1, "path": analysed(**effect)})
     path = made.reference_rad[slice(made.segments["sweep"][0] - 1, made.segments["sweep"][1])]
     left = np.abs(modal_state(path, 1000.0, plant.poles_rad_s)) @ plant.torque_per_state_nm_s

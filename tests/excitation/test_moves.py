@@ -17,14 +17,14 @@ from rigd.excitation.moves import (
     slew,
     vibration_free_path,
 )
-from rigd.identified_beam import MOVE
+from rigd.identified_beam import MOVE_USE
 
 RATE_HZ = 1000.0
 
 
 @pytest.fixture(scope="session")
 def plant(rig):
-    return rig.move_plant("", MOVE)
+    return rig.move_plant("", MOVE_USE)
 
 
 @pytest.fixture(scope="session")

@@ -81,14 +81,16 @@ def test_derivatives_of_modes_match_the_model(name, step):
 
 def test_target_holds_for_all_modes_by_default():
     targets = [parse_target("damping", "1%"), parse_target("frequency", "2:0.1%")]
-    quantities = Quantities.linearised([*targets, parse_target("zeta", "5%")], ESTIMATE)
-    names = [each.target.name for each in quantities.items]
+    quantities = Quantities.from_targets([*targets, parse_target("zeta", "5%")], ESTIMATE)
+    names = [each.target.name for each in quantities.quantity_precisions]
     assert names == [*(f"damping of mode {n}" for n in (1, 2, 3)), "frequency of mode 2", "zeta"]
     covariance = np.diag(np.full(len(UNIFORM), 1e-4))
     found = quantities.precisions(covariance)
     assert found[-1].std == pytest.approx(7.1e-5 * 0.01)
     assert found[-1].reached
-    np.testing.assert_allclose(quantities.ratios(covariance), [each.ratio for each in found])
+    np.testing.assert_allclose(
+        quantities.std_to_target_ratios(covariance), [each.ratio for each in found]
+    )
 
 
 def test_relative_target_of_zero_is_impossible():
@@ -97,10 +99,10 @@ def test_relative_target_of_zero_is_impossible():
         plant=replace(ESTIMATE.plant, damping=Damping()),
         free_parameters=("density_over_stiffness",),
     )
-    found = Quantities.linearised(
+    found = Quantities.from_targets(
         [parse_target("damping", "1%"), parse_target("alpha", "0.1")], none
     )
     precisions = found.precisions(np.eye(1))
-    assert "is 0" in precisions[0].impossible
-    assert "internal damping is absent" in precisions[-1].impossible
+    assert "is 0" in precisions[0].impossible_reason
+    assert "internal damping is absent" in precisions[-1].impossible_reason
     assert not any(each.reached for each in precisions)

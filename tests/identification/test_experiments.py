@@ -50,18 +50,18 @@ def test_speed_has_one_sign_in_every_pass(profile, make):
     speed = close_loop(profile.loop_model()).simulate(excitation.reference_rad).velocity_rad_s
     passes = passes_of(excitation)
     for run in passes:
-        along = speed[run.first : run.end] * np.sign(run.speed_rad_s)
+        along = speed[run.first_tick : run.end_tick] * np.sign(run.speed_rad_s)
         assert along.min() > 0.35 * abs(run.speed_rad_s)
         assert along.mean() == pytest.approx(abs(run.speed_rad_s), rel=0.05)
     assert {np.sign(run.speed_rad_s) for run in passes} == {1.0, -1.0}
-    assert passes[-1].end < excitation.reference_rad.size
+    assert passes[-1].end_tick < excitation.reference_rad.size
 
 
 def test_multisine_excites_its_band_uniformly(profile):
     excitation = multisine_session(profile, torque_percent=60.0, stroke_rad=0.8)
     speed = close_loop(profile.loop_model()).simulate(excitation.reference_rad).velocity_rad_s
     run = passes_of(excitation)[4]
-    spectrum = np.abs(np.fft.rfft(speed[run.first : run.end]))
+    spectrum = np.abs(np.fft.rfft(speed[run.first_tick : run.end_tick]))
     lines = spectrum[3:38]  # 2.5 to 31 Hz
     assert lines.max() < 1.5 * lines.min()
     assert spectrum[45:].max() < 0.1 * lines.min()
@@ -74,7 +74,7 @@ def test_cycles_are_equal_except_for_a_small_offset(profile, make):
     for run in passes_of(excitation):
         by_speed.setdefault(run.speed_rad_s, []).append(run)
     for runs in by_speed.values():
-        passes = np.array([excitation.reference_rad[run.first : run.end] for run in runs])
+        passes = np.array([excitation.reference_rad[run.first_tick : run.end_tick] for run in runs])
         offsets = passes[:, 0] - passes[0, 0]
         assert np.ptp(passes - offsets[:, None], axis=0).max() < 1e-12
         steps = offsets / profile.rig.encoder.resolution_rad

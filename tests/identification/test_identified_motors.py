@@ -119,7 +119,7 @@ def windows_of(excitation, signals, session):
     layout = read_schedule(as_text(excitation))
     return [
         PassReadings(
-            *(signal[run.first : run.end] for signal in signals),
+            *(signal[run.first_tick : run.end_tick] for signal in signals),
             run.speed_rad_s,
             HIGHEST_FREQUENCY_HZ[excitation.kind],
             session,
@@ -203,7 +203,7 @@ def test_random_motors_are_found_within_three_deviations(count):
             least = 0.01 if name == "coulomb_nm" else 0.0
             assert getattr(estimate, name).std < largest * max(truth, least), (number, name)
         assert estimate.misfit < 1.5, number
-        assert estimate.windows > 60, number
+        assert estimate.window_count > 60, number
         all_errors.append(list(errors.values()))
 
     if count < 10:

@@ -182,7 +182,7 @@ def test_windows_with_a_standstill_are_left_out():
     stuck[600:700] = stuck[600]
     windows[0] = replace(windows[0], angle_rad=stuck)
     estimate = estimate_motor(windows, timing_for(truth))
-    assert (estimate.windows, estimate.dropped) == (4 * REPEATS - 1, 1)
+    assert (estimate.window_count, estimate.dropped_window_count) == (4 * REPEATS - 1, 1)
     assert max(map(abs, errors_of(estimate, truth).values())) < 3.0
 
 

@@ -16,8 +16,8 @@ ESTIMATE = MotorEstimate(
     coulomb_nm=MotorQuantity(-1e-5, 4e-5),
     torque_scale=MotorQuantity(1.1, 5e-4),
     actuation_delay_s=MotorQuantity(9.96e-4, 8e-6),
-    windows=72,
-    dropped=0,
+    window_count=72,
+    dropped_window_count=0,
     misfit=1.0,
     friction_departure_nm=1e-4,
 )
