@@ -210,7 +210,7 @@ def _model_document(
         dense_grid(min(shown_frequencies_hz), max(shown_frequencies_hz), peaks_hz)
     )
     magnitude, magnitude_limits = np.abs(response_band.response), response_band.magnitude_limits()
-    selected_bins = response_decimation(response_band.frequency_hz).extremes(magnitude)
+    selected_bins = response_decimation(response_band.frequency_hz).extreme_indices(magnitude)
     return {
         "frequency_hz": _round_digits(response_band.frequency_hz[selected_bins]),
         "magnitude": _round_digits(magnitude[selected_bins]),
@@ -260,7 +260,7 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
         input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
     )
     is_shown_bin = (
-        estimate.excited
+        estimate.is_excited
         & (undelayed_response.frequency_hz >= LOWEST_SHOWN_HZ)
         & np.isfinite(undelayed_response.response)
     )
@@ -268,7 +268,7 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
         undelayed_response.frequency_hz[is_shown_bin],
         undelayed_response.response[is_shown_bin],
     )
-    selected_bins = response_decimation(shown_frequency_hz).extremes(np.abs(shown_response))
+    selected_bins = response_decimation(shown_frequency_hz).extreme_indices(np.abs(shown_response))
     response_document = {
         "frequency_hz": _round_digits(shown_frequency_hz[selected_bins]),
         "magnitude": _round_digits(np.abs(shown_response[selected_bins])),

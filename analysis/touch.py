@@ -43,9 +43,9 @@ from rigd.touch import (
     detector_model,
 )
 from rigd.touch.samples import (
-    CONTACT_S,
-    FINAL_S,
-    HISTORY_S,
+    FINAL_ESTIMATE_S,
+    MAX_CONTACT_S,
+    RECORD_BEFORE_DETECTION_S,
     around_touch,
     base_shear_n,
     touch_record,
@@ -216,11 +216,10 @@ class TouchAnalysis:
         warnings = []
         if shear_coefficients is None:
             warnings.append(
-                "The file states no shear_projection: the touches are estimated from the torque "
-                "alone, which determines instant and point poorly."
+                "The file states no shear_projection: the touches are estimated from the torque alone, which determines instant and point poorly."
             )
         flagged_ticks = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
-        contact_ticks = round(CONTACT_S * rate_hz)
+        contact_ticks = round(MAX_CONTACT_S * rate_hz)
         first_free_ticks = [
             0,
             *(detection_tick + contact_ticks for detection_tick in flagged_ticks),
@@ -237,8 +236,7 @@ class TouchAnalysis:
             )
             if len(detected_ticks) > _MAX_TOUCHES:
                 warnings.append(
-                    f"More than {_MAX_TOUCHES} touches were found, of which the first are shown: "
-                    "the model does not fit the record. Use an identified one (--model)."
+                    f"More than {_MAX_TOUCHES} touches were found, of which the first are shown: the model does not fit the record. Use an identified one (--model)."
                 )
                 detected_ticks = detected_ticks[:_MAX_TOUCHES]
         touches = []
@@ -279,9 +277,9 @@ class TouchAnalysis:
         record_around_touch = touch_record(
             touch_samples, detection_tick, rate_hz, shear_coefficients
         )
-        touch_time_s = record_around_touch.detected / rate_hz
+        touch_time_s = record_around_touch.detection_index / rate_hz
         recorded_after_s = (
-            record_around_touch.angle_rad.size - 1 - record_around_touch.detected
+            record_around_touch.angle_rad.size - 1 - record_around_touch.detection_index
         ) / rate_hz
         angles_rad = record_around_touch.angle_rad
         if (
@@ -292,7 +290,7 @@ class TouchAnalysis:
                 touch_number,
                 detection_tick,
                 touch_time_s,
-                float(angles_rad[record_around_touch.detected]),
+                float(angles_rad[record_around_touch.detection_index]),
                 start_s,
             )
         prepared_model = self._prepare_model(touch_model, rate_hz)
@@ -314,7 +312,7 @@ class TouchAnalysis:
         return Touch(
             touch_number,
             detection_tick,
-            record_around_touch.detected / rate_hz,
+            record_around_touch.detection_index / rate_hz,
             angle_rad,
             start_s,
             touch_estimate,
@@ -333,7 +331,7 @@ class TouchAnalysis:
         )
         if cache_key not in self._prepared:
             x_m = np.linspace(0.0, touch_model.plant.beam.length_m, _ANTENNA_POINTS)
-            sample_count = round((HISTORY_S + FINAL_S) * rate_hz) + 1
+            sample_count = round((RECORD_BEFORE_DETECTION_S + FINAL_ESTIMATE_S) * rate_hz) + 1
             self._prepared[cache_key] = _PreparedModel(
                 TouchEstimator(touch_model, rate_hz),
                 FreeBeam(touch_model, x_m, rate_hz, sample_count),
@@ -374,9 +372,7 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     """
     if tip_mass_kg := stated_tip_mass_kg(session):
         raise RecordError(
-            f"{session.path}: tip_mass_kg = {tip_mass_kg:.4g} kg: the estimation of touches does "
-            "not take a mass at the tip into account; take it off, remove beam.tip_mass_kg from "
-            "the profile, and record again."
+            f"{session.path}: tip_mass_kg = {tip_mass_kg:.4g} kg: the estimation of touches does not take a mass at the tip into account; take it off, remove beam.tip_mass_kg from the profile, and record again."
         )
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
@@ -396,8 +392,7 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     damping: Damping | None = next(filter(None, map(nominal_damping, attached_files)), None)
     if damping is None:
         raise SessionError(
-            f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is "
-            "not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
+            f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
     return TouchModel.assumed(
         replace(undamped_plant, damping=damping), angle_delay_s, sensor_filter
@@ -422,9 +417,7 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
     delay_fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(filter_kind, inf)
     if not 0.0 <= delay_fraction < _MAX_SENSOR_FILTER_TICKS:
         raise RecordError(
-            f"{session.path}: sensor_filter is {filter_kind[:100]!r} with sensor_filter_delay_s = "
-            f"{delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) "
-            f"or a triangle (shorter than a period); correct the file's metadata."
+            f"{session.path}: sensor_filter is {filter_kind[:100]!r} with sensor_filter_delay_s = {delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) or a triangle (shorter than a period); correct the file's metadata."
         )
     averaged_record_count = round(1 / (1 - delay_fraction))
     record_spacing_s = delay_fraction / rate_hz / max(averaged_record_count - 1, 1)
@@ -448,8 +441,7 @@ def _shear_projection(session: Session) -> tuple[float, ...] | None:
         coefficients = ()
     if len(coefficients) != 6 or not np.isfinite(coefficients).all():
         raise RecordError(
-            f"{session.path}: shear_projection is {projection_text[:100]!r}, but must be six "
-            "numbers for fx, fy, fz, tx, ty, tz; correct the file's metadata."
+            f"{session.path}: shear_projection is {projection_text[:100]!r}, but must be six numbers for fx, fy, fz, tx, ty, tz; correct the file's metadata."
         )
     return coefficients if any(coefficients) else None
 
@@ -538,9 +530,7 @@ def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     touches_without_estimate = [touch.number for touch in touches if touch.estimate is None]
     if touches_without_estimate:
         sentences.append(
-            f"Touch {_number_list(touches_without_estimate)}: not estimated, because that requires "
-            f"{_MIN_RECORD_BEFORE_TOUCH_S:g} s of record before a touch and "
-            f"{1e3 * _MIN_RECORD_AFTER_TOUCH_S:g} ms after it."
+            f"Touch {_number_list(touches_without_estimate)}: not estimated, because that requires {_MIN_RECORD_BEFORE_TOUCH_S:g} s of record before a touch and {1e3 * _MIN_RECORD_AFTER_TOUCH_S:g} ms after it."
         )
     unexplained_touches = [
         touch.number
@@ -549,10 +539,7 @@ def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     ]
     if unexplained_touches:
         sentences.append(
-            f"Touch {_number_list(unexplained_touches)}: the record is not explained by the model "
-            f"(residuals more than {sqrt(_LARGEST_CHI2_PER_DEGREE):.1f} times the noise). Use an "
-            "identified model (--model); if there was no contact, such a touch is an error of the "
-            "model."
+            f"Touch {_number_list(unexplained_touches)}: the record is not explained by the model (residuals more than {sqrt(_LARGEST_CHI2_PER_DEGREE):.1f} times the noise). Use an identified model (--model); if there was no contact, such a touch is an error of the model."
         )
     return sentences
 
@@ -572,7 +559,7 @@ def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, touch_time_s: f
     vibration is fitted to the samples of `record` before `touch_time_s` (since the record's start).
     """
     fit_sample_count = min(
-        max(int(touch_time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detected
+        max(int(touch_time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detection_index
     )
     free_motion = free_beam.motion(record, fit_sample_count, fit_sample_count - 4)
     step_index = round((touch_time_s - free_motion.first_s) / free_motion.step_s)

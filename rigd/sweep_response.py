@@ -159,7 +159,7 @@ def response_decimation(frequency_hz: RealArray) -> CurveDecimation:
         Increasing frequencies of the curves' points, shape (n,). Points outside the band of the
         charts are dropped.
     """
-    return CurveDecimation.logarithmic(
+    return CurveDecimation.with_logarithmic_groups(
         frequency_hz, LOWEST_SHOWN_HZ, HIGHEST_SHOWN_HZ, _FREQUENCY_GROUP_COUNT
     )
 

@@ -204,13 +204,13 @@ def welch_fits_tab(analysis: WelchAnalysis) -> rrb.Container:
 
 def _draw_page(fit_page: ChartPage, stream: RecordingStream) -> None:
     """Send the three charts of a page to Rerun, with curves decimated for the screen."""
-    decimation = CurveDecimation.logarithmic(
+    decimation = CurveDecimation.with_logarithmic_groups(
         fit_page.frequency_hz, *fit_page.band_hz, _FREQUENCY_GROUPS
     )
     for graph in fit_page.graphs:
         graph.chart.draw_frame(stream)
         for curve_order, curve in enumerate(graph.curves):
-            curve_strips = decimation.strips(curve.curve_values)
+            curve_strips = decimation.curve_strips(curve.curve_values)
             graph.chart.draw_curve(
                 stream,
                 curve.name,

@@ -23,11 +23,11 @@ from rigd.runtime import ignore_end_signals as ignore_signals
 from rigd.session.layout import Status, decode_samples
 from rigd.touch import GrowingEstimate, TouchEstimator, TouchRecord
 from rigd.touch.samples import (
-    CONTACT_S,
-    FINAL_S,
-    FIRST_S,
-    HISTORY_S,
-    PREVIEW_S,
+    FINAL_ESTIMATE_S,
+    FIRST_ESTIMATE_S,
+    MAX_CONTACT_S,
+    PREVIEW_SEARCH_S,
+    RECORD_BEFORE_DETECTION_S,
     around_touch,
     touch_record,
 )
@@ -107,7 +107,13 @@ class RunningTouchEstimator:
             self._contact_ticks,
         ) = (
             round(duration_s * job.rate_hz)
-            for duration_s in (HISTORY_S, PREVIEW_S, FIRST_S, FINAL_S, CONTACT_S)
+            for duration_s in (
+                RECORD_BEFORE_DETECTION_S,
+                PREVIEW_SEARCH_S,
+                FIRST_ESTIMATE_S,
+                FINAL_ESTIMATE_S,
+                MAX_CONTACT_S,
+            )
         )
         self._samples: NDArray[np.void] | None = None
         self._pending_touches: deque[_PendingTouch] = deque()
@@ -130,7 +136,7 @@ class RunningTouchEstimator:
         )
         for tick in new_samples["tick"][(new_samples["status"] & Status.TOUCHED) != 0].tolist():
             self._count += 1
-            estimate = self._estimator.follow()
+            estimate = self._estimator.growing_estimator()
             self._pending_touches.append(
                 _PendingTouch(self._count, tick, self._contact_end_tick, estimate)
             )
@@ -172,7 +178,7 @@ class RunningTouchEstimator:
     ) -> TouchReport:
         """Return the estimate of a touch from the samples up to a number of ticks after it."""
         record, start_s = self._record_around_touch(pending_touch, ticks_after_touch)
-        touch_estimate = pending_touch.estimate.update(record, scan=False, first=not is_final)
+        touch_estimate = pending_touch.estimate.update(record, scan=False, is_first=not is_final)
         estimate_document = touch_estimate.as_dict(start_s)
         return TouchReport(
             pending_touch.touch_number, pending_touch.tick, is_final, estimate_document
@@ -191,7 +197,7 @@ class RunningTouchEstimator:
         contact_end_tick = min(pending_touch.contact_end_tick, pending_touch.tick)
         samples = around_touch(self._samples, pending_touch.tick, job.rate_hz, contact_end_tick)
         record = touch_record(samples, pending_touch.tick, job.rate_hz, job.shear_projection)
-        return record.until(record.detected + ticks_after_touch), int(
+        return record.first_samples(record.detection_index + ticks_after_touch), int(
             samples["tick"][0]
         ) / job.rate_hz
 

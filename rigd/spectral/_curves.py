@@ -53,7 +53,7 @@ class CurveDecimation:
     groups: npt.NDArray[np.intp]
 
     @classmethod
-    def logarithmic(
+    def with_logarithmic_groups(
         cls, grid: RealArray, first_hz: float, last_hz: float, max_groups: int
     ) -> "CurveDecimation":
         """Return the decimation of a curve over frequency, in groups of equal frequency ratio.
@@ -81,7 +81,7 @@ class CurveDecimation:
             + np.where(index_offsets < group_sizes[:, None], index_offsets, 0),
         )
 
-    def strips(self, curve_values: RealArray) -> list[RealArray]:
+    def curve_strips(self, curve_values: RealArray) -> list[RealArray]:
         """Return the decimated curve as strips (p, 2) of grid value and curve value.
 
         Each strip contains the least and the greatest value of every group. A new strip begins
@@ -101,7 +101,7 @@ class CurveDecimation:
             for strip_indices in map(np.unique, np.split(extreme_indices, strip_starts))
         ]
 
-    def extremes(self, curve_values: RealArray) -> npt.NDArray[np.intp]:
+    def extreme_indices(self, curve_values: RealArray) -> npt.NDArray[np.intp]:
         """Return the increasing grid indices of the least and greatest value of every group.
 
         Parameters
@@ -111,7 +111,7 @@ class CurveDecimation:
         """
         return np.unique(self._extremes(curve_values)[1])
 
-    def gaps(self, curve_values: RealArray) -> npt.NDArray[np.intp]:
+    def gap_edge_indices(self, curve_values: RealArray) -> npt.NDArray[np.intp]:
         """Return the increasing grid indices of the known values on both sides of each gap.
 
         Parameters
@@ -120,9 +120,9 @@ class CurveDecimation:
             Values on the grid, shape (n,); NaN if unknown.
         """
         group_indices, _ = self._extremes(curve_values)
-        before_gaps = np.flatnonzero(np.diff(group_indices) > 1)
-        first_indices = self.groups[group_indices[before_gaps] + 1, 0]
-        last_indices = self.groups[group_indices[before_gaps + 1] - 1].max(axis=1)
+        groups_before_gaps = np.flatnonzero(np.diff(group_indices) > 1)
+        first_indices = self.groups[group_indices[groups_before_gaps] + 1, 0]
+        last_indices = self.groups[group_indices[groups_before_gaps + 1] - 1].max(axis=1)
         return np.unique(np.concatenate([first_indices, last_indices]))
 
     def _extremes(
@@ -137,8 +137,8 @@ class CurveDecimation:
         group_indices = np.flatnonzero(~is_unknown.all(axis=1))
         grouped_values, is_unknown = grouped_values[group_indices], is_unknown[group_indices]
         min_columns = np.where(is_unknown, np.inf, grouped_values).argmin(axis=1)
-        greatest_columns = np.where(is_unknown, -np.inf, grouped_values).argmax(axis=1)
-        extreme_columns = np.stack([min_columns, greatest_columns], axis=1)
+        max_columns = np.where(is_unknown, -np.inf, grouped_values).argmax(axis=1)
+        extreme_columns = np.stack([min_columns, max_columns], axis=1)
         return group_indices, np.take_along_axis(
             self.groups[group_indices], extreme_columns, axis=1
         )

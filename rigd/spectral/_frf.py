@@ -339,11 +339,13 @@ class CrossSpectra:
         """Return an independent copy of the summed spectra."""
         return CrossSpectra(self.sxx.copy(), self.syy.copy(), self.sxy.copy(), self.segments)
 
-    def add(self, fx: NDArray[np.complex128], fy: NDArray[np.complex128]) -> None:
+    def add(
+        self, input_transform: NDArray[np.complex128], output_transform: NDArray[np.complex128]
+    ) -> None:
         """Add a segment, given the transforms (n,) of its input and its output."""
-        self.sxx += power(fx)
-        self.syy += power(fy)
-        self.sxy += fx.conj() * fy
+        self.sxx += power(input_transform)
+        self.syy += power(output_transform)
+        self.sxy += input_transform.conj() * output_transform
         self.segments += 1
 
     def response(
@@ -355,13 +357,13 @@ class CrossSpectra:
         """
         return FrequencyResponse(
             frequency_hz=frequency_hz,
-            response=self._ratio(estimator),
+            response=self._spectra_ratio(estimator),
             coherence=self._coherence() if self.segments > 1 else None,
             segments=self.segments,
             estimator=estimator,
         )
 
-    def _ratio(self, estimator: Literal["h1", "h2", "hv"]) -> NDArray[np.complex128]:
+    def _spectra_ratio(self, estimator: Literal["h1", "h2", "hv"]) -> NDArray[np.complex128]:
         """Return the estimated ratio of output to input in each frequency bin."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if estimator == "h1":

@@ -46,17 +46,17 @@ class RunningEstimate:
     ----------
     response : FrequencyResponse
         Estimated response. Its coherence is None until there are two whole segments.
-    excited : ndarray of bool, shape (n,)
+    is_excited : ndarray of bool, shape (n,)
         Whether the reference has excited each bin of the response. Other bins contain noise and
         leakage.
 
-    final : bool
+    is_final : bool
         Whether the record is complete. The estimate is then equal to that of `welch_response`.
     """
 
     response: FrequencyResponse
-    excited: NDArray[np.bool_]
-    final: bool
+    is_excited: NDArray[np.bool_]
+    is_final: bool
 
 
 class RunningResponse:
@@ -129,7 +129,7 @@ class RunningResponse:
         for first_tick, segment in self._segments.feed(
             ticks, np.stack((reference, input_, output))
         ):
-            self._add(segment, self._sums, self._reference_power)
+            self._add_segment(segment, self._sums, self._reference_power)
             self._summed_up_to = first_tick + self._length
 
     def estimate(self) -> RunningEstimate | None:
@@ -137,11 +137,11 @@ class RunningResponse:
         is_final = self._segments.over
         summed_spectra, reference_power = self._sums, self._reference_power
         newest_samples = self._segments.newest(self._length)
-        shortest_segment = self._length
-        if self._newest_count_as_segment(newest_samples.shape[1], is_final):
+        shortest_segment_length = self._length
+        if self._is_newest_segment_used(newest_samples.shape[1], is_final):
             summed_spectra, reference_power = summed_spectra.copy(), reference_power.copy()
-            self._add(newest_samples, summed_spectra, reference_power)
-            shortest_segment = newest_samples.shape[1]
+            self._add_segment(newest_samples, summed_spectra, reference_power)
+            shortest_segment_length = newest_samples.shape[1]
         if summed_spectra.segments == 0:
             return None
         response = summed_spectra.response(self._frequency_hz, "h1")
@@ -150,17 +150,17 @@ class RunningResponse:
             response = replace(response, coherence=None)
         return RunningEstimate(
             response=response,
-            excited=excited_bins(reference_power, -(-self._nfft // shortest_segment)),
-            final=is_final,
+            is_excited=excited_bins(reference_power, -(-self._nfft // shortest_segment_length)),
+            is_final=is_final,
         )
 
-    def _newest_count_as_segment(self, newest_count: int, is_final: bool) -> bool:
+    def _is_newest_segment_used(self, newest_count: int, is_final: bool) -> bool:
         """Return whether the newest samples count as a segment in addition to whole segments."""
         if self._segments.end == self._summed_up_to or (is_final and self._sums.segments):
             return False
         return newest_count >= MIN_SEGMENT_FRACTION * self._length
 
-    def _add(
+    def _add_segment(
         self,
         segment: NDArray[np.float64],
         summed_spectra: CrossSpectra,
@@ -281,8 +281,8 @@ class Segments:
 class _GapFiller:
     """Filler of gaps in blocks of samples: short gaps are interpolated, long gaps split a block."""
 
-    def __init__(self, longest_gap: int) -> None:
-        self._longest = longest_gap
+    def __init__(self, max_gap_ticks: int) -> None:
+        self._longest = max_gap_ticks
         self._last: tuple[NDArray[np.int64], RealArray] | None = None
 
     def fill(self, ticks: ArrayLike, channel_values: ArrayLike) -> Iterator[tuple[int, RealArray]]:
@@ -402,12 +402,12 @@ class LowBinTransform:
         self._work = np.empty(convolution_length, dtype=np.complex128)
         self._transform = np.empty(convolution_length, dtype=np.complex128)
 
-    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def __call__(self, samples: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the lowest bins (bins,) of the transform of samples (n,), as a new array."""
         if self._all is not None:
-            return np.fft.rfft(x, self._nfft, out=self._all)[: self._bins].copy()
-        self._work[x.size :] = 0.0
-        np.multiply(x, self._chirp[: x.size], out=self._work[: x.size])
+            return np.fft.rfft(samples, self._nfft, out=self._all)[: self._bins].copy()
+        self._work[samples.size :] = 0.0
+        np.multiply(samples, self._chirp[: samples.size], out=self._work[: samples.size])
         np.fft.fft(self._work, out=self._transform)
         self._transform *= self._kernel
         np.fft.ifft(self._transform, out=self._work)

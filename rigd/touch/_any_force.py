@@ -38,7 +38,9 @@ class AnyForceLikelihood:
     force_std_n: float
     """Likeliest standard deviation of the force at the likeliest position."""
 
-    def interval(self, log_likelihood_drop: float = 1.92) -> tuple[float, float, float, float]:
+    def position_interval_m(
+        self, log_likelihood_drop: float = 1.92
+    ) -> tuple[float, float, float, float]:
         """Return the likeliest position, its standard deviation and the ends of its interval, in m.
 
         At the ends the log-likelihood is lower by `log_likelihood_drop`; 1.92 gives 95 %.
@@ -46,7 +48,7 @@ class AnyForceLikelihood:
         fine_positions_m = np.linspace(self.x_m[0], self.x_m[-1], 4000)
         log_likelihood = np.interp(fine_positions_m, self.x_m, self.log_likelihood)
         best_index = int(np.argmax(self.log_likelihood))
-        best_m = float(self.x_m[best_index])
+        best_position_m = float(self.x_m[best_index])
         if 0 < best_index < self.x_m.size - 1:
             left_value, best_value, right_value = self.log_likelihood[
                 best_index - 1 : best_index + 2
@@ -54,19 +56,26 @@ class AnyForceLikelihood:
             curvature = left_value - 2 * best_value + right_value
             if curvature < 0:
                 spacing_m = self.x_m[1] - self.x_m[0]
-                best_m += float(
+                best_position_m += float(
                     np.clip(0.5 * (left_value - right_value) / curvature, -1, 1) * spacing_m
                 )
-        likely_m = fine_positions_m[log_likelihood >= log_likelihood.max() - log_likelihood_drop]
+        likely_positions_m = fine_positions_m[
+            log_likelihood >= log_likelihood.max() - log_likelihood_drop
+        ]
         likelihood_weights = np.exp(log_likelihood - log_likelihood.max())
-        mean_m = np.sum(likelihood_weights * fine_positions_m) / np.sum(likelihood_weights)
-        std_m = float(
+        mean_position_m = np.sum(likelihood_weights * fine_positions_m) / np.sum(likelihood_weights)
+        position_std_m = float(
             np.sqrt(
-                np.sum(likelihood_weights * (fine_positions_m - mean_m) ** 2)
+                np.sum(likelihood_weights * (fine_positions_m - mean_position_m) ** 2)
                 / np.sum(likelihood_weights)
             )
         )
-        return best_m, std_m, min(float(likely_m[0]), best_m), max(float(likely_m[-1]), best_m)
+        return (
+            best_position_m,
+            position_std_m,
+            min(float(likely_positions_m[0]), best_position_m),
+            max(float(likely_positions_m[-1]), best_position_m),
+        )
 
 
 class AnyForceEstimator:
@@ -89,7 +98,7 @@ class AnyForceEstimator:
                 ],
                 0.0,
             )
-            for response_table in (kernels.torque, kernels.shear)
+            for response_table in (kernels.torque_nm_per_n, kernels.shear_per_n)
         ]  # (positions, samples, forces)
 
     def scan(self, sample_window: WhitenedWindow) -> AnyForceLikelihood:
@@ -106,8 +115,8 @@ class AnyForceEstimator:
             ],
             axis=1,
         )
-        force_effects = sample_window.whitening @ force_effects
-        whitened_data = sample_window.data
+        force_effects = sample_window.whitening_matrix @ force_effects
+        whitened_data = sample_window.whitened_innovations
         n = whitened_data.size
         force_covariance = force_effects @ force_effects.transpose(0, 2, 1)
         bordered_corner = float(whitened_data @ whitened_data) + 1.0

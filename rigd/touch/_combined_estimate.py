@@ -55,10 +55,10 @@ def estimate_from_explanations(
     """
     obstacle_fit = explanation_search.fit
     explanations, sample_window = explained_record.explanations, explained_record.window
-    at_rest = explanations[0]
+    resting_explanation = explanations[0]
     best_explanation = min(explanations, key=lambda explanation: explanation.chi2)
-    if at_rest.chi2 < best_explanation.chi2 + DECISIVE_CHI2_DIFFERENCE:
-        best_explanation = at_rest
+    if resting_explanation.chi2 < best_explanation.chi2 + DECISIVE_CHI2_DIFFERENCE:
+        best_explanation = resting_explanation
     likely_explanations = [
         best_explanation,
         *(
@@ -68,35 +68,35 @@ def estimate_from_explanations(
         ),
     ]
     is_unambiguous = len(likely_explanations) == 1 and best_explanation.kind != "two"
-    if best_explanation is at_rest:
+    if best_explanation is resting_explanation:
         likely_explanations += [
             explanation for explanation in explanations if explanation.kind == "two"
         ]
-    begin_s = obstacle_fit.record_offset / obstacle_fit.rate_hz
+    record_begin_s = obstacle_fit.record_offset / obstacle_fit.rate_hz
     x_m = time_s = force_n = stiffness_n_per_m = None
     force_history_n, force_times_s = np.zeros(0), np.zeros(0)
     obstacle_kind = "unknown"
     if obstacle_fit.fits(best_explanation, sample_window):
         is_poor_fit = not obstacle_fit.fits(best_explanation, sample_window, POOR_FIT_STDS)
         is_doubtful = (
-            explained_record.later_samples_contradict or explained_record.other_kinds_untried
-            if best_explanation is at_rest
+            explained_record.has_contradicting_later_samples or explained_record.has_untried_kinds
+            if best_explanation is resting_explanation
             else is_poor_fit
         )
         if is_unambiguous and not is_doubtful:
             obstacle_kind = best_explanation.kind
         x_m, time_s = (
             _position_estimate(obstacle_fit, likely_explanations),
-            _parameter_estimate(likely_explanations, 1, begin_s),
+            _parameter_estimate(likely_explanations, 1, record_begin_s),
         )
         x_m = _with_interval_including(x_m, explained_record.first_obstacle_positions_m)
-        if is_poor_fit or explained_record.other_kinds_untried:
+        if is_poor_fit or explained_record.has_untried_kinds:
             x_m = _with_any_force_interval(obstacle_fit, x_m)
         force_history_n, force_times_s, force_n = _force_estimate(
             obstacle_fit, best_explanation, sample_window
         )
         if obstacle_kind == "rigid":
-            stiffness_n_per_m = _stiffness_estimate(at_rest.posterior)
+            stiffness_n_per_m = _stiffness_estimate(resting_explanation.posterior)
     elif (
         obstacle_fit.any_force_likelihood.chi2
         < obstacle_fit.max_chi2(obstacle_fit.any_force_likelihood.expected_chi2)
@@ -111,15 +111,15 @@ def estimate_from_explanations(
         kind=obstacle_kind,
         model=obstacle_fit.tables.model.source,
         channels=obstacle_fit.motion.noise_stds.size,
-        samples=sample_window.end_sample - obstacle_fit.detected,
+        samples=sample_window.end_sample - obstacle_fit.detection_index,
         chi2_per_degree=best_explanation.chi2
-        / (sample_window.data.size - best_explanation.parameters.size),
+        / (sample_window.whitened_innovations.size - best_explanation.parameters.size),
         positions_m=obstacle_fit.any_force_likelihood.x_m if scan else np.zeros(0),
         log_likelihood=obstacle_fit.any_force_likelihood.log_likelihood if scan else np.zeros(0),
         innovations=obstacle_fit.motion.innovations / obstacle_fit.motion.noise_stds[:, None],
-        innovation_times_s=obstacle_fit.motion.t + begin_s,
+        innovation_times_s=obstacle_fit.motion.t + record_begin_s,
         force_history_n=force_history_n,
-        force_times_s=force_times_s + begin_s,
+        force_times_s=force_times_s + record_begin_s,
     )
 
 
@@ -135,13 +135,13 @@ def _unexplained_position(obstacle_fit: ObstacleFit) -> TouchQuantity:
     ]
     interval_ends = np.array(
         [
-            likelihood.interval(_WIDE_LIKELIHOOD_DROP)[2:]
+            likelihood.position_interval_m(_WIDE_LIKELIHOOD_DROP)[2:]
             for likelihood in (obstacle_fit.any_force_likelihood, *early_likelihoods)
         ]
     )
     low_m, high_m = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
     return TouchQuantity(
-        obstacle_fit.any_force_likelihood.interval(_WIDE_LIKELIHOOD_DROP)[0],
+        obstacle_fit.any_force_likelihood.position_interval_m(_WIDE_LIKELIHOOD_DROP)[0],
         (high_m - low_m) / 4,
         (low_m, high_m),
     )
@@ -149,7 +149,7 @@ def _unexplained_position(obstacle_fit: ObstacleFit) -> TouchQuantity:
 
 def _with_any_force_interval(obstacle_fit: ObstacleFit, estimate: TouchQuantity) -> TouchQuantity:
     """Return a touch position in m, whose interval includes the interval for an arbitrary force."""
-    *_, low_m, high_m = obstacle_fit.any_force_likelihood.interval()
+    *_, low_m, high_m = obstacle_fit.any_force_likelihood.position_interval_m()
     low_m, high_m = min(low_m, estimate.interval_95[0]), max(high_m, estimate.interval_95[1])
     return TouchQuantity(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
 
@@ -161,9 +161,9 @@ def _with_interval_including(estimate: TouchQuantity, positions_m: RealArray) ->
     )
     if (low_m, high_m) == estimate.interval_95:
         return estimate
-    farthest_m = max(high_m - estimate.value, estimate.value - low_m)
+    max_distance_m = max(high_m - estimate.value, estimate.value - low_m)
     return TouchQuantity(
-        estimate.value, max(estimate.std, farthest_m / _NORMAL_QUANTILE_95), (low_m, high_m)
+        estimate.value, max(estimate.std, max_distance_m / _NORMAL_QUANTILE_95), (low_m, high_m)
     )
 
 
@@ -171,24 +171,27 @@ def _position_estimate(
     obstacle_fit: ObstacleFit, likely_explanations: list[Explanation]
 ) -> TouchQuantity:
     """Return the touch position in m, less certain because of bounces or a second obstacle."""
-    position = _parameter_estimate(likely_explanations, 0)
-    is_near_tip = position.value > NEAR_TIP_FRACTION * obstacle_fit.tables.model.plant.beam.length_m
+    position_estimate = _parameter_estimate(likely_explanations, 0)
+    is_near_tip = (
+        position_estimate.value > NEAR_TIP_FRACTION * obstacle_fit.tables.model.plant.beam.length_m
+    )
     additional_std_m = (
         _TWO_OBSTACLES_STD_M
         if likely_explanations[0].kind == "two"
         else _BOUNCE_STDS_M[int(is_near_tip)]
     )
     low_m, high_m = (
-        position.value
+        position_estimate.value
         + np.copysign(
-            np.hypot(end - position.value, _NORMAL_QUANTILE_95 * additional_std_m), interval_sign
+            np.hypot(end - position_estimate.value, _NORMAL_QUANTILE_95 * additional_std_m),
+            interval_sign,
         )
-        for end, interval_sign in zip(position.interval_95, (-1.0, 1.0), strict=True)
+        for end, interval_sign in zip(position_estimate.interval_95, (-1.0, 1.0), strict=True)
     )
     length_m = obstacle_fit.tables.model.plant.beam.length_m
     return TouchQuantity(
-        position.value,
-        float(np.hypot(position.std, additional_std_m)),
+        position_estimate.value,
+        float(np.hypot(position_estimate.std, additional_std_m)),
         (max(float(low_m), 0.0), min(float(high_m), length_m)),
     )
 
@@ -206,18 +209,20 @@ def _force_estimate(
     rng = np.random.default_rng(2)
     posterior = best_explanation.posterior
     drawn_indices = rng.choice(posterior.weights.size, 48, p=posterior.weights)
-    candidates = np.vstack([best_explanation.parameters, posterior.samples[drawn_indices]])
+    parameter_candidates = np.vstack(
+        [best_explanation.parameters, posterior.samples[drawn_indices]]
+    )
     step_s = obstacle_fit.tables.middle_kernels.step_s
     if best_explanation.kind == "knock":
-        peak_forces_n = np.abs(candidates[:, 3])
-        pulse_phase = np.arange(0.0, np.exp(candidates[0, 2]) + step_s, step_s) / np.exp(
-            candidates[0, 2]
+        peak_forces_n = np.abs(parameter_candidates[:, 3])
+        pulse_phase = np.arange(0.0, np.exp(parameter_candidates[0, 2]) + step_s, step_s) / np.exp(
+            parameter_candidates[0, 2]
         )
         force_history_n = peak_forces_n[:1, None] * np.sin(np.pi * np.minimum(pulse_phase, 1.0))
     elif best_explanation.kind == "two":
         step_s = obstacle_fit.tables.coarse_kernels.step_s
         force_history_n = np.abs(
-            obstacle_fit.two_obstacle_contact().predict(candidates, sample_window)[1]
+            obstacle_fit.two_obstacle_contact().predict(parameter_candidates, sample_window)[1]
         )
         peak_forces_n = force_history_n.max(axis=1)
     else:
@@ -228,9 +233,9 @@ def _force_estimate(
         )
         pressing_sign = None if best_explanation.kind == "rigid" else obstacle_fit.pressing_sign()
         if best_explanation.kind == "yielding":
-            candidates = np.insert(candidates, 3, 0.0, axis=1)
+            parameter_candidates = np.insert(parameter_candidates, 3, 0.0, axis=1)
         force_history_n = np.abs(
-            obstacle_contact.predict(candidates, sample_window, pressing_sign)[1]
+            obstacle_contact.predict(parameter_candidates, sample_window, pressing_sign)[1]
         )
         peak_forces_n = force_history_n.max(axis=1)
     low_n, high_n = np.quantile(peak_forces_n[1:], (0.025, 0.975))
@@ -241,7 +246,7 @@ def _force_estimate(
     )
     return (
         force_history_n[0],
-        candidates[0, 1] + step_s * np.arange(force_history_n.shape[1]),
+        parameter_candidates[0, 1] + step_s * np.arange(force_history_n.shape[1]),
         peak_force,
     )
 

@@ -18,38 +18,38 @@ _BLOCK_STEPS, _SHORT_BLOCK_STEPS = 16, 6
 """Numbers of time steps in a block: usual, and with many candidates. The effects of forces before
 the block are summed for all its steps at once; within it, each step updates all later ones, so that
 shorter blocks are faster with many candidates."""
-_MANY_CANDIDATES = 1000
+_MIN_SHORT_BLOCK_CANDIDATES = 1000
 """Number of candidates above which shorter blocks are used."""
-_SAMPLES_AT_ONCE = 16
+_SAMPLES_PER_BLOCK = 16
 """Number of samples whose convolution is computed at once, with as many earlier forces as the last
 sample needs."""
 
 
 def integrate_contact(
     kernel: NDArray[_Precision],
-    approach: NDArray[_Precision],
+    approach_m: NDArray[_Precision],
     stiffness_n_per_m: NDArray[_Precision],
     step_s: float,
-    rate_m_per_s: RealArray | float = 0.0,
+    obstacle_speed_m_per_s: RealArray | float = 0.0,
     mobility_m_per_n_s: RealArray | float = 0.0,
 ) -> NDArray[_Precision]:
     """Return the force with which the beam presses on an obstacle, at each step since the touch.
 
-    The force is a magnitude in N, 0 without contact, with the shape of `approach`. `kernel` is the
-    displacement in the direction of the force per hat of force, in m/N, shape (k, n). `approach` is
-    the distance in m by which the beam would be beyond the point of touch if there were no force, 0
-    at the first step, shape (k, n), or (k, g, n) for g candidates of each kernel; the stiffness has
-    the shape (k,) or (k, g). The obstacle moves away from the beam at `rate_m_per_s` and yields at
-    `mobility_m_per_n_s` times the force.
+    The force is a magnitude in N, 0 without contact, with the shape of `approach_m`. `kernel` is
+    the displacement in the direction of the force per hat of force, in m/N, shape (k, n).
+    `approach_m` is the distance in m by which the beam would be beyond the point of touch if there
+    were no force, 0 at the first step, shape (k, n), or (k, g, n) for g candidates of each kernel;
+    the stiffness has the shape (k,) or (k, g). The obstacle moves away from the beam at
+    `obstacle_speed_m_per_s` and yields at `mobility_m_per_n_s` times the force.
     """
-    result_shape = approach.shape
+    result_shape = approach_m.shape
     kernel_count, step_count = kernel.shape
     # An obstacle that moves away shortens the approach; one that yields acts as a softer beam.
-    if np.any(rate_m_per_s):
+    if np.any(obstacle_speed_m_per_s):
         obstacle_motion_m = np.multiply.outer(
-            np.asarray(rate_m_per_s) * step_s, np.arange(step_count)
+            np.asarray(obstacle_speed_m_per_s) * step_s, np.arange(step_count)
         )
-        approach = approach - obstacle_motion_m.astype(approach.dtype)
+        approach_m = approach_m - obstacle_motion_m.astype(approach_m.dtype)
     if np.any(mobility_m_per_n_s):
         yield_per_step = np.asarray(mobility_m_per_n_s, kernel.dtype) * step_s
         kernel = kernel + yield_per_step[..., None]
@@ -57,7 +57,7 @@ def integrate_contact(
     # Force of a step without earlier ones: (n, k, g).
     effective_stiffness = kernel_stiffness / (1 + kernel_stiffness * kernel[:, :1])
     free_force_n = (
-        approach.reshape(kernel_count, -1, step_count).transpose(2, 0, 1) * effective_stiffness
+        approach_m.reshape(kernel_count, -1, step_count).transpose(2, 0, 1) * effective_stiffness
     )
     group_size = kernel_stiffness.shape[1]
     forces_n = np.zeros((kernel_count, step_count, group_size), free_force_n.dtype)
@@ -66,7 +66,9 @@ def integrate_contact(
     row_stride, column_stride = reversed_kernel.strides
     # Within a block each force is subtracted from the later steps. All views are made once.
     block_steps = (
-        _BLOCK_STEPS if kernel_count * group_size < _MANY_CANDIDATES else _SHORT_BLOCK_STEPS
+        _BLOCK_STEPS
+        if kernel_count * group_size < _MIN_SHORT_BLOCK_CANDIDATES
+        else _SHORT_BLOCK_STEPS
     )
     block_forces, block_reductions = np.zeros(
         (2, block_steps, kernel_count * group_size), free_force_n.dtype
@@ -86,12 +88,12 @@ def integrate_contact(
     zero_forces = np.zeros(kernel_count * group_size, free_force_n.dtype)
     first_contact_step = step_count
     for block_begin in range(1, step_count, block_steps):
-        end = min(block_begin + block_steps, step_count)
-        block_force_n = free_force_n[block_begin:end]
+        block_end = min(block_begin + block_steps, step_count)
+        block_force_n = free_force_n[block_begin:block_end]
         if first_contact_step < block_begin:
             # Element (k, i, j): effect of force first_contact_step + j at step block_begin + i.
             earlier_block_effect = np.ndarray(
-                (kernel_count, end - block_begin, block_begin - first_contact_step),
+                (kernel_count, block_end - block_begin, block_begin - first_contact_step),
                 reversed_kernel.dtype,
                 buffer=reversed_kernel,
                 offset=(step_count - 1 - block_begin + first_contact_step) * column_stride,
@@ -108,27 +110,27 @@ def integrate_contact(
         if not block_force_n.max() > 0:
             continue  # no candidate is in contact
         first_contact_step = min(first_contact_step, block_begin)
-        block_forces[: end - block_begin] = block_force_n.reshape(end - block_begin, -1)
+        block_forces[: block_end - block_begin] = block_force_n.reshape(block_end - block_begin, -1)
         for step_forces_n, lag, lag_product, later_reductions in block_views:
             np.maximum(step_forces_n, zero_forces, out=step_forces_n)
             np.multiply(lag, step_forces_n, out=lag_product)
             np.subtract(later_reductions, lag_product, out=later_reductions)
-        block_slice = block_forces[: end - block_begin].reshape(-1, kernel_count, group_size)
-        forces_n[:, block_begin:end] = block_slice.transpose(1, 0, 2)
+        block_slice = block_forces[: block_end - block_begin].reshape(-1, kernel_count, group_size)
+        forces_n[:, block_begin:block_end] = block_slice.transpose(1, 0, 2)
     return np.ascontiguousarray(forces_n.transpose(0, 2, 1)).reshape(result_shape)
 
 
 def integrate_two_contacts(
     own_kernels: tuple[RealArray, RealArray],
     cross_kernel: RealArray,
-    approach: tuple[RealArray, RealArray],
+    approaches_m: tuple[RealArray, RealArray],
     stiffness_n_per_m: tuple[RealArray, RealArray],
 ) -> tuple[RealArray, RealArray]:
     """Return the forces with which the beam presses on two obstacles at rest, at each step.
 
     The forces are magnitudes in N, 0 without contact, shape (k, n). Kernels are displacements per
     hat of force in m/N, shape (k, n): at each obstacle by its own force, and at one by the force of
-    the other, positive in the directions of the two forces. `approach` is the distance in m by
+    the other, positive in the directions of the two forces. `approaches_m` is the distance in m by
     which the beam would be beyond each obstacle if there were no force; it is not positive at the
     first step.
     """
@@ -141,7 +143,7 @@ def integrate_two_contacts(
         ]
     )
     free_force_n = (
-        np.stack([obstacle_approach.T for obstacle_approach in approach], axis=1)
+        np.stack([obstacle_approach.T for obstacle_approach in approaches_m], axis=1)
         * effective_stiffness
     )
     # Reduction of one force by another, by the lag; axes: lag, reduced, reducing.
@@ -156,15 +158,15 @@ def integrate_two_contacts(
     *outer_strides, column_stride = reversed_kernel.strides
     forces_n = np.zeros((pair_count, 2, step_count))
     block_forces = np.empty((_BLOCK_STEPS, 2, pair_count))
-    product = np.empty((_BLOCK_STEPS, 2, 2, pair_count))
+    reduction_buffer = np.empty((_BLOCK_STEPS, 2, 2, pair_count))
     for block_begin in range(1, step_count, _BLOCK_STEPS):
-        end = min(block_begin + _BLOCK_STEPS, step_count)
-        block_force_n = block_forces[: end - block_begin]
-        block_force_n[:] = free_force_n[block_begin:end]
+        block_end = min(block_begin + _BLOCK_STEPS, step_count)
+        block_force_n = block_forces[: block_end - block_begin]
+        block_force_n[:] = free_force_n[block_begin:block_end]
         if block_begin > 1:
             # Element (k, a, b, i, j): effect of the force of step 1 + j at b on a, step begin + i.
             later_effect = np.ndarray(
-                (pair_count, 2, 2, end - block_begin, block_begin - 1),
+                (pair_count, 2, 2, block_end - block_begin, block_begin - 1),
                 buffer=reversed_kernel,
                 offset=(step_count - block_begin) * column_stride,
                 strides=(*outer_strides, -column_stride, column_stride),
@@ -185,11 +187,11 @@ def integrate_two_contacts(
             reductions = np.multiply(
                 kernel[1 : len(later_reductions) + 1],
                 step_forces_n[None, None],
-                out=product[: len(later_reductions)],
+                out=reduction_buffer[: len(later_reductions)],
             )
             later_reductions -= reductions[:, :, 0]
             later_reductions -= reductions[:, :, 1]
-        forces_n[..., block_begin:end] = block_force_n.transpose(2, 1, 0)
+        forces_n[..., block_begin:block_end] = block_force_n.transpose(2, 1, 0)
     return forces_n[:, 0], forces_n[:, 1]
 
 
@@ -240,7 +242,7 @@ def contact_responses(
     candidate_count, step_count = forces_n.shape
     kernel_tables = np.stack(kernels, axis=1)
     kernel_steps = min(kernel_tables.shape[2], step_count)
-    if len(kernel_tables) == 1 and candidate_count > _SAMPLES_AT_ONCE:  # one matrix for all
+    if len(kernel_tables) == 1 and candidate_count > _SAMPLES_PER_BLOCK:  # one matrix for all
         lag_steps = steps_per_sample * np.arange(sample_count) - np.arange(step_count)[:, None]
         lag_table = np.where(
             (lag_steps >= 0) & (lag_steps < kernel_steps),
@@ -253,16 +255,16 @@ def contact_responses(
     reversed_force[:, :step_count] = forces_n[:, ::-1]
     row_stride, column_stride = reversed_force.strides
     summed_responses = np.empty((candidate_count, len(kernels), sample_count))
-    for first_index in range(0, sample_count, _SAMPLES_AT_ONCE):
-        end = min(first_index + _SAMPLES_AT_ONCE, sample_count)
-        history_steps = min(kernel_steps, (end - 1) * steps_per_sample + 1)
+    for first_index in range(0, sample_count, _SAMPLES_PER_BLOCK):
+        block_end = min(first_index + _SAMPLES_PER_BLOCK, sample_count)
+        history_steps = min(kernel_steps, (block_end - 1) * steps_per_sample + 1)
         history_view = np.ndarray(
-            (candidate_count, 1, end - first_index, history_steps),
+            (candidate_count, 1, block_end - first_index, history_steps),
             buffer=reversed_force,
             offset=(step_count - 1 - first_index * steps_per_sample) * column_stride,
             strides=(row_stride, 0, -steps_per_sample * column_stride, column_stride),
         )
-        summed_responses[:, :, first_index:end] = np.vecdot(
+        summed_responses[:, :, first_index:block_end] = np.vecdot(
             kernel_tables[:, :, None, :history_steps], history_view
         )
     return summed_responses

@@ -27,12 +27,12 @@ from rigd.touch._templates import DetectorModel
 
 RealArray = NDArray[np.float64]
 
-_INDEPENDENT_FRACTION: Final = 0.5
+_INDEPENDENT_TEMPLATE_FRACTION: Final = 0.5
 """Number of independent tests per template and tick, because templates overlap; measured at
 thresholds of 4 to 5 standard deviations."""
 _ERROR_ACCUMULATION_TICKS: Final = 8
 """Number of ticks over which errors of the model are assumed to accumulate."""
-_RECENT_WEIGHT: Final = 1 / 600
+_RECENT_SAMPLE_WEIGHT: Final = 1 / 600
 """Weight of each new tick in the moving average of the correlations' mean square."""
 
 
@@ -61,7 +61,9 @@ class DetectorSettings:
         >>> round(DetectorSettings().threshold(1000.0, template_count=500), 2)
         6.69
         """
-        tests_per_hour = 3600.0 * rate_hz * max(1.0, _INDEPENDENT_FRACTION * template_count)
+        tests_per_hour = (
+            3600.0 * rate_hz * max(1.0, _INDEPENDENT_TEMPLATE_FRACTION * template_count)
+        )
         return -NormalDist().inv_cdf(0.5 * self.false_alarms_per_hour / tests_per_hour)
 
 
@@ -73,7 +75,7 @@ class TouchDetector:
 
     Parameters
     ----------
-    beam
+    detector_model
         Model of the beam and templates of contacts, from `rigd.touch.detector_model`.
     rate_hz
         Ticks a second.
@@ -107,9 +109,11 @@ class TouchDetector:
         "noise",
     )
 
-    def __init__(self, beam: DetectorModel, rate_hz: float, settings: DetectorSettings) -> None:
-        templates = beam.templates
-        self._filter = InnovationFilter(beam.observed)
+    def __init__(
+        self, detector_model: DetectorModel, rate_hz: float, settings: DetectorSettings
+    ) -> None:
+        templates = detector_model.templates
+        self._filter = InnovationFilter(detector_model.observed_beam)
         self._threshold = settings.threshold(rate_hz, len(templates))
         self._squared_tolerance = _ERROR_ACCUMULATION_TICKS * settings.model_tolerance**2
         self._is_armed = False
@@ -134,7 +138,7 @@ class TouchDetector:
 
     def arm(self) -> None:
         """Start to detect touches with the next tick."""
-        self._filter.follow_zeros()
+        self._filter.follow_sensor_zeros()
         if self._rest_ticks:
             torque_std, shear_std = (
                 sqrt(square_sum / self._rest_ticks) for square_sum in self._rest_square_sums
@@ -154,7 +158,7 @@ class TouchDetector:
         The observer still follows the vibration, but not the zeros of torque and shear.
         """
         self._is_armed = False
-        self._filter.hold_zeros()
+        self._filter.hold_sensor_zeros()
         self.level = 0.0
 
     def contact_force_n(self, shear_n: float) -> float:
@@ -214,7 +218,7 @@ class TouchDetector:
         correlations, mean_squares = self._correlations, self._mean_squares
         self._correlate(self._windows[window_slot], correlations)
         # A touch must not raise its own threshold: its correlations enter the average later.
-        self._recent_mean_square += _RECENT_WEIGHT * (
+        self._recent_mean_square += _RECENT_SAMPLE_WEIGHT * (
             mean_squares[window_slot] - self._recent_mean_square
         )
         mean_squares[window_slot] = float(correlations.dot(correlations)) / correlations.size

@@ -13,9 +13,9 @@ from rigd.touch._model import TouchModel
 from rigd.touch._results import TouchEstimate
 from rigd.touch._tables import DETECTION_DELAYS_S, TouchTables
 
-_MIN_SAMPLES_BEFORE = 100
+_MIN_SAMPLES_BEFORE_TOUCH = 100
 """Smallest number of samples before a touch that an estimate requires."""
-_POOR_MISFIT = 3.0
+_MAX_RESTING_MISFIT = 3.0
 """Mean square residual of an obstacle at rest, divided by the noise variance, above which the touch
 may have begun earlier."""
 
@@ -63,9 +63,9 @@ class TouchEstimator:
         scan
             Whether the estimate contains the likelihood of each position; otherwise that is empty.
         """
-        return self.follow().update(touch_record, scan=scan)
+        return self.growing_estimator().update(touch_record, scan=scan)
 
-    def follow(self) -> "GrowingEstimate":
+    def growing_estimator(self) -> "GrowingEstimate":
         """Return an estimator of one touch for records that grow from call to call."""
         return GrowingEstimate(self._tables)
 
@@ -94,7 +94,7 @@ class GrowingEstimate:
         Parameters
         ----------
         touch_record
-            Samples up to `PREVIEW_S` after the detection or somewhat later.
+            Samples up to `PREVIEW_SEARCH_S` after the detection or somewhat later.
         """
         for detection_delay_s in DETECTION_DELAYS_S[
             :-1
@@ -105,7 +105,7 @@ class GrowingEstimate:
                 return
 
     def update(
-        self, record: TouchRecord, *, scan: bool = True, first: bool = False
+        self, record: TouchRecord, *, scan: bool = True, is_first: bool = False
     ) -> TouchEstimate:
         """Return the estimate of the touch from the samples so far.
 
@@ -115,42 +115,42 @@ class GrowingEstimate:
             Samples from 0.3 s or more before the touch.
         scan
             Whether the estimate contains the likelihood of each position; otherwise that is empty.
-        first
+        is_first
             Whether this is the first estimate. Only one and two obstacles at rest are then tried,
             because other kinds take a second; a touch of another kind is reported as unknown.
         """
-        latest_result = None
-        searched_from = record.angle_rad.size
+        latest_estimate = None
+        first_searched_sample = record.angle_rad.size
         # The delay with which an earlier record was explained comes first.
         for detection_delay_s in sorted(
-            DETECTION_DELAYS_S, key=lambda each: each != self._explaining_delay_s
+            DETECTION_DELAYS_S, key=lambda delay_s: delay_s != self._explaining_delay_s
         ):
             if not self._has_enough_samples(record, detection_delay_s):
                 continue
             explanation_search = self._search(record, detection_delay_s)
             if detection_delay_s != self._explaining_delay_s and (
                 # A longer delay only if the touch may begin before the window of the shorter one.
-                explanation_search.likely_first_sample >= searched_from
-                or self._began_earlier(record, detection_delay_s)
+                explanation_search.likely_first_sample >= first_searched_sample
+                or self._touch_began_earlier(record, detection_delay_s)
             ):
                 continue
             touch_estimate = estimate_from_explanations(
-                explanation_search, explanation_search.explain(first=first), scan=scan
+                explanation_search, explanation_search.explain(is_first=is_first), scan=scan
             )
-            if latest_result is None or touch_estimate.explained:
-                latest_result = touch_estimate
+            if latest_estimate is None or touch_estimate.explained:
+                latest_estimate = touch_estimate
             if touch_estimate.explained:
                 self._explaining_delay_s = detection_delay_s
-            if touch_estimate.explained or first:
+            if touch_estimate.explained or is_first:
                 break
-            searched_from = explanation_search.fit.first_touch_sample
-        return latest_result or self._empty_estimate(record)
+            first_searched_sample = explanation_search.fit.first_touch_sample
+        return latest_estimate or self._empty_estimate(record)
 
     def _has_enough_samples(self, touch_record: TouchRecord, detection_delay_s: float) -> bool:
         """Return whether 100 samples precede a touch `detection_delay_s` before its detection."""
         return (
-            touch_record.detected - round(detection_delay_s * self._tables.rate_hz)
-            >= _MIN_SAMPLES_BEFORE
+            touch_record.detection_index - round(detection_delay_s * self._tables.rate_hz)
+            >= _MIN_SAMPLES_BEFORE_TOUCH
         )
 
     def _search(self, touch_record: TouchRecord, detection_delay_s: float) -> ExplanationSearch:
@@ -165,7 +165,7 @@ class GrowingEstimate:
             )
         return self._searches[detection_delay_s]
 
-    def _began_earlier(self, touch_record: TouchRecord, detection_delay_s: float) -> bool:
+    def _touch_began_earlier(self, touch_record: TouchRecord, detection_delay_s: float) -> bool:
         """Return whether a touch probably began more than `detection_delay_s` before detection."""
         if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
@@ -173,7 +173,7 @@ class GrowingEstimate:
         if explanation_search.begins_before_window:
             return True
         longer_delay_s = DETECTION_DELAYS_S[DETECTION_DELAYS_S.index(detection_delay_s) + 1]
-        if explanation_search.misfit < _POOR_MISFIT or not self._has_enough_samples(
+        if explanation_search.misfit < _MAX_RESTING_MISFIT or not self._has_enough_samples(
             touch_record, longer_delay_s
         ):
             return False
@@ -195,7 +195,7 @@ class GrowingEstimate:
             kind="unknown",
             model=self._tables.model.source,
             channels=channel_count,
-            samples=touch_record.angle_rad.size - touch_record.detected,
+            samples=touch_record.angle_rad.size - touch_record.detection_index,
             chi2_per_degree=np.nan,
             positions_m=empty_array,
             log_likelihood=empty_array,

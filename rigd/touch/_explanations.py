@@ -30,29 +30,29 @@ from rigd.touch._obstacle_fit import (
 from rigd.touch._other_kinds import (
     DECISIVE_CHI2_DIFFERENCE,
     explain_by_motion_or_impact,
-    explain_by_two,
+    explain_by_two_obstacles,
     may_move_or_yield,
 )
 from rigd.touch._posterior import Posterior
 from rigd.touch._tables import GRID_COMPARISON_S, TouchTables
-from rigd.touch.samples import FINAL_S, FIRST_S
+from rigd.touch.samples import FINAL_ESTIMATE_S, FIRST_ESTIMATE_S
 
 RealArray = NDArray[np.float64]
 
-_STAGE_ENDS_S = (FIRST_S, 0.1, FINAL_S)
+_STAGE_ENDS_S = (FIRST_ESTIMATE_S, 0.1, FINAL_ESTIMATE_S)
 """Times in s after the detection at which the stages of the explanation end; each stage explains a
 longer part of the record. Later stages follow only if an obstacle at rest explains the earlier ones
 and the position is still uncertain."""
 _MIN_STAGE_GROWTH = 1.2
 """Smallest ratio of the available time to the end of a stage for which the stage is not left
 out."""
-_PRECISE_STD_M = 2e-3
+_PRECISE_POSITION_STD_M = 2e-3
 """Standard deviation in m of the position below which no longer part of the record is explained."""
-_RANDOM_CANDIDATES = 96
+_RANDOM_CANDIDATE_COUNT = 96
 """Number of candidates that a stage draws from the posterior distribution of the previous stage."""
-_NEARBY_OFFSETS_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
+_NEARBY_POSITION_OFFSETS_M = np.array([-4e-3, -2e-3, 2e-3, 4e-3])
 """Distances in m from the best candidates near the tip to additional candidates."""
-_TIP_FRACTION = 0.95
+_NEAR_TIP_FRACTION = 0.95
 """Fraction of the beam's length beyond which later samples do not improve the position, because
 many short contacts can be fitted at any position."""
 _MAX_LATER_MISFIT_STDS = 2.5
@@ -69,9 +69,9 @@ class ExplainedRecord:
     """One explanation for each kind of obstacle tried; the first is an obstacle at rest."""
     window: WhitenedWindow
     """Part of the record that is explained."""
-    later_samples_contradict: bool
+    has_contradicting_later_samples: bool
     """Whether the samples after `window` contradict an obstacle at rest."""
-    other_kinds_untried: bool
+    has_untried_kinds: bool
     """Whether a kind of obstacle that was not tried may be likelier."""
     first_obstacle_positions_m: RealArray
     """Positions in m of the first of two obstacles, for pairs that explain the record as well as
@@ -103,7 +103,7 @@ class ExplanationSearch:
         self._grid_candidates: RealArray = (
             previous_search._grid_candidates
             if previous_search and covers_grid
-            else self._best_of_grid()
+            else self._best_grid_candidates()
         )
         self._resting_stage: tuple[Explanation, float] | None
         self._resting_stage = None if previous_search is None else previous_search._resting_stage
@@ -119,40 +119,42 @@ class ExplanationSearch:
     @property
     def likely_first_sample(self) -> int:
         """Index of the record's sample nearest to the likeliest touch of the grid search."""
-        after_quiet_s = float(self.grid_starts[0, 1] - self.fit.motion.t[self.fit.quiet_samples])
-        return self.fit.first_touch_sample + round(after_quiet_s * self.fit.rate_hz)
+        time_after_quiet_s = float(
+            self.grid_starts[0, 1] - self.fit.motion.t[self.fit.quiet_samples]
+        )
+        return self.fit.first_touch_sample + round(time_after_quiet_s * self.fit.rate_hz)
 
     @property
     def misfit(self) -> float:
         """Mean square residual of an obstacle at rest in the first samples; noise alone gives 1."""
-        return float(self._first_minima.chi2.min() / self._first_samples.data.size)
+        return float(self._first_minima.chi2.min() / self._first_window.whitened_innovations.size)
 
-    def explain(self, *, first: bool) -> ExplainedRecord:
+    def explain(self, *, is_first: bool) -> ExplainedRecord:
         """Return the explanations of the record by the kinds of obstacle that are likely.
 
-        With `first` set, only obstacles at rest are tried, because other kinds take longer.
+        With `is_first` set, only obstacles at rest are tried, because other kinds take longer.
         """
-        resting_explanation, sample_window, two_obstacles, later_samples_contradict = (
+        resting_explanation, sample_window, two_obstacles, has_contradicting_later_samples = (
             self._explain_in_stages()
         )
         explanations = [resting_explanation]
-        other_kinds_untried = False
+        has_untried_kinds = False
         first_obstacle_positions_m: RealArray = np.zeros(0)
         if two_obstacles is None:
             needs_other_kinds = not self.fit.fits(
                 resting_explanation, sample_window, POOR_FIT_STDS
             ) or may_move_or_yield(self.fit, resting_explanation, sample_window)
-            if needs_other_kinds and first:
-                other_kinds_untried = True
+            if needs_other_kinds and is_first:
+                has_untried_kinds = True
             elif needs_other_kinds:
                 explanations += explain_by_motion_or_impact(self.fit, sample_window)
             if self.fit.fits(resting_explanation, sample_window):
-                two_obstacles, first_obstacle_positions_m = explain_by_two(
+                two_obstacles, first_obstacle_positions_m = explain_by_two_obstacles(
                     self.fit, resting_explanation, sample_window
                 )
                 # If two obstacles are much likelier than one, another kind may be as likely as two.
-                other_kinds_untried |= (
-                    first
+                has_untried_kinds |= (
+                    is_first
                     and two_obstacles is not None
                     and two_obstacles.chi2 < resting_explanation.chi2 - DECISIVE_CHI2_DIFFERENCE
                 )
@@ -161,8 +163,8 @@ class ExplanationSearch:
         return ExplainedRecord(
             explanations,
             sample_window,
-            later_samples_contradict=later_samples_contradict,
-            other_kinds_untried=other_kinds_untried,
+            has_contradicting_later_samples=has_contradicting_later_samples,
+            has_untried_kinds=has_untried_kinds,
             first_obstacle_positions_m=first_obstacle_positions_m,
         )
 
@@ -175,34 +177,34 @@ class ExplanationSearch:
         explains; the explanation of the same part by two obstacles, or None unless only two explain
         its later samples; and whether the samples after the part contradict an obstacle at rest.
         """
-        available_s = self.fit.samples_after_detection / self.fit.rate_hz
+        available_time_s = self.fit.samples_after_detection / self.fit.rate_hz
         stage_ends_s = [
             stage_end_s
             for stage_end_s in _STAGE_ENDS_S
-            if _MIN_STAGE_GROWTH * stage_end_s <= available_s
+            if _MIN_STAGE_GROWTH * stage_end_s <= available_time_s
         ]
-        stage_ends_s.append(available_s)
+        stage_ends_s.append(available_time_s)
         previous_stage: tuple[Explanation, WhitenedWindow] | None = None
         if self._resting_stage is None:
             start_candidates = self._add_neighbours(_distinct_minima(self._first_minima))
         else:
-            at_rest, explained_s = self._resting_stage
+            resting_explanation, explained_s = self._resting_stage
             stage_ends_s = [
                 stage_end_s for stage_end_s in stage_ends_s if stage_end_s > explained_s
             ]
-            start_candidates = self._next_candidates(at_rest)
+            start_candidates = self._next_candidates(resting_explanation)
             self.fit.include_uncertainties(start_candidates, max([explained_s, *stage_ends_s[:1]]))
             stage_window = self.fit.window(explained_s)
             [previous_chi2] = chi2_of(
                 self.fit.predictor(start_candidates[:1]), stage_window, start_candidates[:1]
             )
-            previous_stage = replace(at_rest, chi2=float(previous_chi2)), stage_window
+            previous_stage = replace(resting_explanation, chi2=float(previous_chi2)), stage_window
             if self._is_sufficient(*previous_stage, explained_s):
                 stage_ends_s = []
         for stage_end_s in stage_ends_s:
             self.fit.include_uncertainties(start_candidates, stage_end_s)
             stage_window = self.fit.window(stage_end_s)
-            at_rest = self.fit.explain_by_kind(
+            resting_explanation = self.fit.explain_by_kind(
                 "rigid",
                 self.fit.predictor(start_candidates),
                 stage_window,
@@ -210,23 +212,25 @@ class ExplanationSearch:
                 self.fit.parameter_ranges(3),
             )
             if previous_stage is not None and self._later_samples_fit_worse(
-                at_rest, stage_window, *previous_stage
+                resting_explanation, stage_window, *previous_stage
             ):
-                two_obstacles, _ = explain_by_two(self.fit, at_rest, stage_window)
+                two_obstacles, _ = explain_by_two_obstacles(
+                    self.fit, resting_explanation, stage_window
+                )
                 if two_obstacles is not None and self.fit.fits(
                     two_obstacles, stage_window, POOR_FIT_STDS
                 ):
-                    return at_rest, stage_window, two_obstacles, False
+                    return resting_explanation, stage_window, two_obstacles, False
                 # In later bounces the search may miss the minimum, so that they contradict nothing.
                 is_contradicted = stage_end_s <= UNCERTAINTIES_END_S and may_move_or_yield(
-                    self.fit, at_rest, stage_window
+                    self.fit, resting_explanation, stage_window
                 )
                 return *previous_stage, None, is_contradicted
-            previous_stage = at_rest, stage_window
-            self._resting_stage = at_rest, stage_end_s
-            if self._is_sufficient(at_rest, stage_window, stage_end_s):
+            previous_stage = resting_explanation, stage_window
+            self._resting_stage = resting_explanation, stage_end_s
+            if self._is_sufficient(resting_explanation, stage_window, stage_end_s):
                 break
-            start_candidates = self._next_candidates(at_rest)
+            start_candidates = self._next_candidates(resting_explanation)
         assert previous_stage is not None  # there is at least one stage, or an earlier one
         return *previous_stage, None, False
 
@@ -234,15 +238,15 @@ class ExplanationSearch:
         self,
         resting_explanation: Explanation,
         sample_window: WhitenedWindow,
-        after_detection_s: float,
+        time_after_detection_s: float,
     ) -> bool:
         """Return whether a longer part of the record would not improve the explanation."""
         x_m = resting_explanation.posterior.mean(0)
         is_precise = (
-            resting_explanation.posterior.std(0) < _PRECISE_STD_M
-            or x_m > _TIP_FRACTION * self.fit.position_range_m[1]
+            resting_explanation.posterior.std(0) < _PRECISE_POSITION_STD_M
+            or x_m > _NEAR_TIP_FRACTION * self.fit.position_range_m[1]
         )
-        return after_detection_s > FIRST_S and bool(
+        return time_after_detection_s > FIRST_ESTIMATE_S and bool(
             is_precise or not self.fit.fits(resting_explanation, sample_window)
         )
 
@@ -254,7 +258,9 @@ class ExplanationSearch:
         shorter_window: WhitenedWindow,
     ) -> bool:
         """Return whether the shorter window is explained, but not the samples added to it."""
-        added_samples = longer_window.data.size - shorter_window.data.size
+        added_samples = (
+            longer_window.whitened_innovations.size - shorter_window.whitened_innovations.size
+        )
         added_chi2 = longer_explanation.chi2 - shorter_explanation.chi2
         return self.fit.fits(
             shorter_explanation, shorter_window
@@ -270,7 +276,7 @@ class ExplanationSearch:
         """Return random candidates near samples of a posterior distribution, shape (k, p)."""
         rng = np.random.default_rng(1)
         drawn_candidates = posterior.samples[
-            rng.choice(posterior.weights.size, _RANDOM_CANDIDATES, p=posterior.weights)
+            rng.choice(posterior.weights.size, _RANDOM_CANDIDATE_COUNT, p=posterior.weights)
         ]
         parameter_count = drawn_candidates.shape[1]
         parameter_ranges = self.fit.parameter_ranges(parameter_count)
@@ -282,20 +288,20 @@ class ExplanationSearch:
         )
         return np.clip(
             drawn_candidates + 0.5 * random_spread * rng.standard_normal(drawn_candidates.shape),
-            parameter_ranges.low,
-            parameter_ranges.high,
+            parameter_ranges.lower_limits,
+            parameter_ranges.upper_limits,
         )
 
     # Candidates of the grid
 
-    def _best_of_grid(self) -> RealArray:
+    def _best_grid_candidates(self) -> RealArray:
         """Return the four likeliest candidates of the grid at each position, shape (k, 3)."""
         grid_window = self.fit.window(GRID_COMPARISON_S)
         candidate_grid = self.fit.tables.candidate_grid(
             grid_window.end_sample - grid_window.first_sample
         )
         grid_candidates, chi2 = candidate_grid.integrate(
-            self.fit.motion, grid_window, self.fit.detected
+            self.fit.motion, grid_window, self.fit.detection_index
         )
         grid_candidates = grid_candidates[np.lexsort((chi2, grid_candidates[:, 0]))]
         candidates_per_position = grid_candidates.shape[0] // np.unique(grid_candidates[:, 0]).size
@@ -305,13 +311,15 @@ class ExplanationSearch:
         return best_candidates
 
     @cached_property
-    def _first_samples(self) -> WhitenedWindow:
+    def _first_window(self) -> WhitenedWindow:
         """Whitened innovations of the first samples, with which the best of the grid are compared.
 
         Only the uncertainty of the free motion is included, not its effect on the contact.
         """
         return WhitenedWindow.from_motion(
-            self.fit.motion, self.fit.quiet_samples, self.fit.sample_after_detection(FIRST_S)
+            self.fit.motion,
+            self.fit.quiet_samples,
+            self.fit.sample_after_detection(FIRST_ESTIMATE_S),
         )
 
     @cached_property
@@ -321,8 +329,8 @@ class ExplanationSearch:
             self.fit.tables.coarse_kernels, self.fit.tables.x_m, self.fit.motion
         )
         chi2 = chi2_of(
-            lambda rows, window: coarse_contact.predict(rows, window)[0],
-            self._first_samples,
+            lambda candidate_rows, window: coarse_contact.predict(candidate_rows, window)[0],
+            self._first_window,
             self._grid_candidates,
         )
         return self._grid_candidates[np.argsort(chi2)[:12]]
@@ -330,10 +338,10 @@ class ExplanationSearch:
     @cached_property
     def _first_minima(self) -> LocalMinima:
         """Local minima of the sum of squared residuals that are found from `grid_starts`."""
-        predict_effect = self.fit.predictor(self.grid_starts, coarse=True)
+        predict_effect = self.fit.predictor(self.grid_starts, uses_coarse_kernels=True)
         return find_minima(
             predict_effect,
-            self._first_samples,
+            self._first_window,
             self.grid_starts,
             self.fit.parameter_ranges(3),
             max_iterations=7,
@@ -349,9 +357,10 @@ class ExplanationSearch:
             <= NEAR_TIP_FRACTION * self.fit.tables.model.plant.beam.length_m
         ):
             return candidates
-        nearby_candidates = np.repeat(candidates[None, :2], _NEARBY_OFFSETS_M.size, axis=0)
+        nearby_candidates = np.repeat(candidates[None, :2], _NEARBY_POSITION_OFFSETS_M.size, axis=0)
         nearby_candidates[:, :, 0] = np.clip(
-            nearby_candidates[:, :, 0] + _NEARBY_OFFSETS_M[:, None], *self.fit.position_range_m
+            nearby_candidates[:, :, 0] + _NEARBY_POSITION_OFFSETS_M[:, None],
+            *self.fit.position_range_m,
         )
         return np.vstack([candidates, nearby_candidates.reshape(-1, candidates.shape[1])])
 

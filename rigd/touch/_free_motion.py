@@ -20,7 +20,7 @@ from rigd.beam import (
     poles,
     root_shear_ratio,
 )
-from rigd.touch._kernels import DECAY_EXPONENT, chebyshev_nodes
+from rigd.touch._kernels import TRANSFORM_DECAY_EXPONENT, chebyshev_nodes
 from rigd.touch._model import TouchModel
 
 RealArray = NDArray[np.float64]
@@ -28,16 +28,16 @@ ComplexArray = NDArray[np.complex128]
 
 STEPS_PER_SAMPLE = 4
 """Number of time steps of the free motion per sample; a spline interpolates the angle to them."""
-_BAND_FRACTION = 0.5
+_COMPUTED_BAND_FRACTION = 0.5
 """Highest frequency that is computed, as a fraction of the Nyquist frequency of the time steps."""
 _MAX_MODE_HZ = 330.0
 """Highest frequency in Hz of the modes whose free vibrations are fitted."""
-_SETTLING_S = 0.03
+_ANGLE_SETTLING_S = 0.03
 """Time constant in s with which the angle is continued to rest after the record's end. A jump at
 the end would cause computed vibrations before it."""
 _SPEED_WINDOW_S = 0.02
 """Duration in s of the first samples from which the initial speed is estimated."""
-_NODE_COUNT = 36
+_POSITION_NODE_COUNT = 36
 """Number of positions from which the displacement at all other positions is interpolated."""
 SPLINE_FADE_SAMPLES = 24
 """Number of samples after which the effect of one sample on a spline has faded."""
@@ -55,20 +55,24 @@ class TouchRecord:
     """Measured coupling torque, shape (n,)."""
     shear_n: RealArray | None
     """Measured base shear, shape (n,); None if the profile does not define it."""
-    detected: int
+    detection_index: int
     """Index of the sample at which the touch was detected."""
 
-    def until(self, samples: int) -> "TouchRecord":
+    def first_samples(self, sample_count: int) -> "TouchRecord":
         """Return the record of the first samples only, with the same detection.
 
         Parameters
         ----------
-        samples
+        sample_count
             Number of samples.
         """
-        shear_n = None if self.shear_n is None else self.shear_n[:samples]
+        shear_n = None if self.shear_n is None else self.shear_n[:sample_count]
         return TouchRecord(
-            self.rate_hz, self.angle_rad[:samples], self.torque_nm[:samples], shear_n, self.detected
+            self.rate_hz,
+            self.angle_rad[:sample_count],
+            self.torque_nm[:sample_count],
+            shear_n,
+            self.detection_index,
         )
 
 
@@ -109,7 +113,9 @@ class FreeBeam:
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
         n = next_fast_len(STEPS_PER_SAMPLE * round(1.6 * sample_count + 0.1 * rate_hz), real=True)
         step_hz = STEPS_PER_SAMPLE * rate_hz
-        self.transform = CausalTransform(n, step_hz, DECAY_EXPONENT, _BAND_FRACTION * step_hz / 2)
+        self.transform = CausalTransform(
+            n, step_hz, TRANSFORM_DECAY_EXPONENT, _COMPUTED_BAND_FRACTION * step_hz / 2
+        )
         s = self.transform.s
         self._force_grid = force_grid = PointForceGrid(s, model.plant.beam, model.plant.damping)
         filter_response = model.sensor_filter.response(s)
@@ -147,8 +153,8 @@ class FreeBeam:
         """
         self.x_m = x_m
         nodes_m, self._interpolation = x_m, np.eye(x_m.size)
-        if x_m.size > _NODE_COUNT:
-            nodes_m, self._interpolation = chebyshev_nodes(x_m, _NODE_COUNT)
+        if x_m.size > _POSITION_NODE_COUNT:
+            nodes_m, self._interpolation = chebyshev_nodes(x_m, _POSITION_NODE_COUNT)
         self._node_displacement: ComplexArray = self._force_grid.displacement_per_angle(nodes_m).T
         self.free_vibration = self.free_vibration.at_positions(x_m / self.model.plant.beam.length_m)
 
@@ -327,8 +333,8 @@ def _interpolate_angle(
     record_steps_s = step_times_s[step_times_s <= t[-1]]
     times_after_s = np.arange(1, transform.length - record_steps_s.size + 1) / transform.rate_hz
     end_speed_rad_s = np.polyfit(t[-6:] - t[-1], relative_angle_rad[-6:], 1)[0]
-    ending_angle_rad = relative_angle_rad[-1] + end_speed_rad_s * _SETTLING_S * (
-        1 - np.exp(-times_after_s / _SETTLING_S)
+    ending_angle_rad = relative_angle_rad[-1] + end_speed_rad_s * _ANGLE_SETTLING_S * (
+        1 - np.exp(-times_after_s / _ANGLE_SETTLING_S)
     )
     fade_factors = 0.5 + 0.5 * np.cos(np.pi * np.minimum(times_after_s / times_after_s[-1], 1.0))
     return (
@@ -355,8 +361,8 @@ class FreeVibration:
     def from_model(cls, model: TouchModel, x_m: RealArray) -> "FreeVibration":
         """Return the free vibrations of a model, with the displacement at positions `x_m`."""
         beam, damping = model.plant.beam, model.plant.damping
-        candidate_modes = 12
-        mode_poles = poles(beam, damping, candidate_modes)[:, 0]
+        candidate_mode_count = 12
+        mode_poles = poles(beam, damping, candidate_mode_count)[:, 0]
         mode_count = max(1, int(np.sum(mode_poles.imag < 2 * np.pi * _MAX_MODE_HZ)))
         mode_poles = mode_poles[:mode_count]
         wave_numbers = clamped_free_eigenvalues(mode_count) / beam.length_m
@@ -379,9 +385,11 @@ class FreeVibration:
         )
         return without_shapes.at_positions(x_m / beam.length_m)
 
-    def at_positions(self, fractions: RealArray) -> "FreeVibration":
+    def at_positions(self, position_fractions: RealArray) -> "FreeVibration":
         """Return the same free vibrations with displacements at other fractions of the length."""
-        mode_shapes = np.stack([mode_shape(i + 1, fractions) for i in range(self.poles.size)])
+        mode_shapes = np.stack(
+            [mode_shape(i + 1, position_fractions) for i in range(self.poles.size)]
+        )
         return replace(self, displacement_shapes=mode_shapes * self.amplitude_units[:, None])
 
     def torque_and_shear(self, t: RealArray) -> RealArray:

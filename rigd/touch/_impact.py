@@ -8,7 +8,7 @@ from rigd.touch._obstacle_contact import ObstacleContact, ParameterRanges, White
 
 RealArray = NDArray[np.float64]
 
-_DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
+_IMPACT_DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
 """Durations of the pulse in s from which the search starts."""
 
 
@@ -36,11 +36,13 @@ class ImpactResponse:
         free_motion = sample_window.motion
         last_time_s = free_motion.t[sample_window.end_sample - 1]
         step_count = int(np.ceil((last_time_s - parameters[:, 1].min()) / self._kernels.step_s)) + 3
-        step_count = min(step_count, self._kernels.steps)
+        step_count = min(step_count, self._kernels.step_count)
         local_kernels = self._kernels.at_positions(parameters[:, 0], step_count)
         pulse_phase = np.arange(step_count) * self._kernels.step_s / np.exp(parameters[:, 2:3])
         forces_n = parameters[:, 3:4] * np.sin(np.pi * np.minimum(pulse_phase, 1.0))
-        kernel_tables = (local_kernels.torque, local_kernels.shear)[: free_motion.noise_stds.size]
+        kernel_tables = (local_kernels.torque_nm_per_n, local_kernels.shear_per_n)[
+            : free_motion.noise_stds.size
+        ]
         return self._contact.force_effects(kernel_tables, forces_n, parameters[:, 1], sample_window)
 
     def start_candidates(
@@ -56,7 +58,7 @@ class ImpactResponse:
             [
                 grid_axis.ravel()
                 for grid_axis in np.meshgrid(
-                    positions_m, np.log(_DURATIONS_S), [1.0], indexing="ij"
+                    positions_m, np.log(_IMPACT_DURATIONS_S), [1.0], indexing="ij"
                 )
             ],
             axis=1,
@@ -70,10 +72,12 @@ class ImpactResponse:
             delayed_effect[:, :, delay_samples:] = unit_effects[
                 :, :, : unit_effects.shape[2] - delay_samples
             ]
-            delayed_effects = sample_window.data - sample_window.residuals(delayed_effect)
+            delayed_effects = sample_window.whitened_innovations - sample_window.residuals(
+                delayed_effect
+            )
             effect_power = np.einsum("kn,kn->k", delayed_effects, delayed_effects) + 1e-300
-            peaks_n = delayed_effects @ sample_window.data / effect_power
-            chi2_reduction = peaks_n**2 * effect_power
+            peak_forces_n = delayed_effects @ sample_window.whitened_innovations / effect_power
+            chi2_reduction = peak_forces_n**2 * effect_power
             best_rows = np.argsort(-chi2_reduction)[:impact_count]
             candidate_parts.append(
                 np.column_stack(
@@ -82,7 +86,7 @@ class ImpactResponse:
                         impact_grid[best_rows, 0],
                         np.full(best_rows.size, sample_window.motion.t[sample_index]),
                         impact_grid[best_rows, 1],
-                        peaks_n[best_rows],
+                        peak_forces_n[best_rows],
                     ]
                 )
             )

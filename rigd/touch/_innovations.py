@@ -29,10 +29,10 @@ from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complexfloating]
 
-_CANDIDATE_MODES = 40
+_CANDIDATE_MODE_COUNT = 40
 """Number of the beam's first modes, of which the filter represents those of low enough
 frequency."""
-_MAX_FREQUENCY_FRACTION = 0.42
+_MAX_FREQUENCY_PER_RATE = 0.42
 """Highest frequency of the filter's modes, as a fraction of the tick rate; delay taps approximate
 higher modes."""
 _MIN_IMAGINARY_FRACTION = 0.5
@@ -42,14 +42,14 @@ _REAL_POLE_COUNT = 10
 """Number of real poles, which approximate the branch cut of fractional-order damping."""
 _SLOWEST_REAL_POLE_RAD_S = 0.03
 """Magnitude of the slowest real pole in rad/s."""
-_DELAY_TAPS = 4
+_DELAY_TAP_COUNT = 4
 """Number of delay taps of the filter: the present and past angles, with a coefficient each."""
 _FIT_START_HZ, _FIT_END_FRACTION = 0.02, 0.45
 """Band in which the filter is fitted: lower end in Hz, upper end as a fraction of the tick rate."""
 _FULL_WEIGHT_START_HZ, _FULL_WEIGHT_END_HZ = 0.3, 50.0
 """Lower and upper end in Hz of the band in which the relative error of the fit has full weight.
 Above it motors hardly move, and a close fit would only amplify the noise of the encoder."""
-_OBSERVED_MODES = 4
+_OBSERVED_MODE_COUNT = 4
 """Number of modes whose vibration the observer follows."""
 _VIBRATION_BANDWIDTH_RAD_S = 6.0
 """Bandwidth in rad/s with which the observer follows vibration: slow compared with a touch (15
@@ -70,21 +70,21 @@ class ObservedBeam:
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> noise = ChannelNoise(torque_nm=5e-3, shear_n=0.02)
     >>> model = observed_beam(beam, Damping(zeta=7e-5), 1000.0, noise)
-    >>> model.states, model.matrix.shape
+    >>> model.state_count, model.step_matrix.shape
     (39, (43, 42))
     """
 
-    matrix: RealArray
+    step_matrix: RealArray
     """Matrix of a tick from [state, angle, torque, shear] to [next state, whitened innovations,
     whitened prediction], shape (n + 4, n + 3). Without shear, the rows and the column of shear are
     zero."""
-    gain: RealArray
+    observer_gain: RealArray
     """Effect of each whitened innovation on the next state, shape (n, 2)."""
     whitening: RealArray
     """Matrix from innovations in N·m and N to whitened innovations, shape (2, 2)."""
-    states: int
+    state_count: int
     """Number n of states."""
-    channels: int
+    channel_count: int
     """Number of measured quantities: 1 for torque alone, 2 for torque and base shear."""
 
 
@@ -193,19 +193,22 @@ class InnovationFilter:
     )
 
     def __init__(self, model: ObservedBeam) -> None:
-        n = self._states = model.states
+        n = self._states = model.state_count
         self._unwhitening = (0.0, 0.0)
-        if model.channels == 2:
+        if model.channel_count == 2:
             torque_coefficient, shear_coefficient = np.linalg.inv(model.whitening)[1].tolist()
             self._unwhitening = torque_coefficient, shear_coefficient
         # The zeros are the last states: without a gain they stay what they are.
-        zeros = np.arange(n - model.channels, n)
-        holding_matrix, holding_gain = model.matrix.copy(), model.gain.copy()
-        holding_matrix[zeros] = np.eye(n + 3)[zeros]
-        holding_gain[zeros] = 0.0
+        zero_state_indices = np.arange(n - model.channel_count, n)
+        holding_matrix, holding_gain = model.step_matrix.copy(), model.observer_gain.copy()
+        holding_matrix[zero_state_indices] = np.eye(n + 3)[zero_state_indices]
+        holding_gain[zero_state_indices] = 0.0
         self._following_zeros, self._holding_zeros = (
             (np.asfortranarray(matrix).dot, gain)
-            for matrix, gain in ((model.matrix, model.gain), (holding_matrix, holding_gain))
+            for matrix, gain in (
+                (model.step_matrix, model.observer_gain),
+                (holding_matrix, holding_gain),
+            )
         )
         self._multiply, self._gain = self._following_zeros
         # In turn input [state, angle, torque, shear] and output [state, whitened, predicted].
@@ -255,11 +258,11 @@ class InnovationFilter:
         else:
             self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
 
-    def hold_zeros(self) -> None:
+    def hold_sensor_zeros(self) -> None:
         """Hold the zeros of torque and shear, so that a contact force does not shift them."""
         self._multiply, self._gain = self._holding_zeros
 
-    def follow_zeros(self) -> None:
+    def follow_sensor_zeros(self) -> None:
         """Let the observer follow the zeros of torque and shear again."""
         self._multiply, self._gain = self._following_zeros
 
@@ -328,7 +331,9 @@ def _fit_filter(
     Its complex poles are those of the exact model. Real poles and delay taps approximate the
     remaining response. The coefficients are fitted by least squares.
     """
-    pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_CANDIDATE_MODES), beam, damping)
+    pole_pairs = poles_for_eigenvalues(
+        clamped_free_eigenvalues(_CANDIDATE_MODE_COUNT), beam, damping
+    )
     upper_poles = pole_pairs[_is_represented_mode(pole_pairs[:, 0], rate_hz), 0]
     complex_poles: ComplexArray = np.exp(upper_poles / rate_hz)
     real_poles: RealArray = np.exp(
@@ -351,14 +356,14 @@ def _fit_filter(
     fit_weights = np.minimum(1.0, (_FULL_WEIGHT_END_HZ / frequency_hz) ** 3)
     fit_weights *= np.minimum(1.0, frequency_hz / _FULL_WEIGHT_START_HZ)
     term_responses = _term_responses(s / rate_hz, complex_poles, real_poles)
-    rest_response = _term_responses(np.zeros(1, dtype=complex), complex_poles, real_poles).real
+    static_response = _term_responses(np.zeros(1, dtype=complex), complex_poles, real_poles).real
     coefficients = np.empty((2, term_responses.shape[1]))
     for row, fit_target in zip(coefficients, exact_response, strict=True):
         fit_scale = fit_weights / np.abs(fit_target)
         weighted_columns = term_responses * fit_scale[:, None]
         # An angle at rest must give exactly no torque, not only a small one.
         least_squares_matrix = np.concatenate(
-            [weighted_columns.real, weighted_columns.imag, 1e4 * rest_response]
+            [weighted_columns.real, weighted_columns.imag, 1e4 * static_response]
         )
         right_hand_side = np.concatenate(
             [(fit_target * fit_scale).real, (fit_target * fit_scale).imag, [0.0]]
@@ -385,7 +390,7 @@ def _is_represented_mode(upper_poles: ComplexArray, rate_hz: float) -> NDArray[n
     is_represented: NDArray[np.bool_] = upper_poles.imag > _MIN_IMAGINARY_FRACTION * np.abs(
         upper_poles
     )
-    return is_represented & (upper_poles.imag < 2 * pi * _MAX_FREQUENCY_FRACTION * rate_hz)
+    return is_represented & (upper_poles.imag < 2 * pi * _MAX_FREQUENCY_PER_RATE * rate_hz)
 
 
 def _term_responses(
@@ -407,7 +412,7 @@ def _term_responses(
             upper_terms + lower_terms,
             1j * (upper_terms - lower_terms),
             real_terms,
-            tick_delay ** np.arange(_DELAY_TAPS),
+            tick_delay ** np.arange(_DELAY_TAP_COUNT),
         ],
         axis=1,
     )
@@ -424,7 +429,7 @@ def _state_space(
     The state depends on past angles only; the present one acts through ``d``.
     """
     m, k = complex_poles.size, real_poles.size
-    n = 2 * m + k + _DELAY_TAPS - 1
+    n = 2 * m + k + _DELAY_TAP_COUNT - 1
     a, b = np.zeros((n, n)), np.zeros(n)
     even_states = np.arange(0, 2 * m, 2)
     a[even_states, even_states] = a[even_states + 1, even_states + 1] = complex_poles.real
@@ -443,11 +448,11 @@ def _state_space(
     c[:, even_states] = 2 * coefficients[:, :m]
     c[:, even_states + 1] = -2 * coefficients[:, m : 2 * m]
     c[:, real_states] = coefficients[:, 2 * m : 2 * m + k]
-    c[:, delay_states] = coefficients[:, -_DELAY_TAPS + 1 :]
+    c[:, delay_states] = coefficients[:, -_DELAY_TAP_COUNT + 1 :]
     d = (
         2 * coefficients[:, :m].sum(axis=1)
         + coefficients[:, 2 * m : 2 * m + k].sum(axis=1)
-        + coefficients[:, -_DELAY_TAPS]
+        + coefficients[:, -_DELAY_TAP_COUNT]
     )
     return _AngleFilter(a, b, c, d, noise_gain)
 
@@ -475,12 +480,12 @@ def _design_observer(
     """Return the stationary Kalman filter that follows vibrating modes and drifting zeros."""
     from scipy.linalg import solve_discrete_are
 
-    z = clamped_free_eigenvalues(_OBSERVED_MODES)
+    z = clamped_free_eigenvalues(_OBSERVED_MODE_COUNT)
     upper_poles = poles_for_eigenvalues(z, beam, damping)[:, 0]
-    represented = _is_represented_mode(upper_poles, rate_hz)
+    is_represented = _is_represented_mode(upper_poles, rate_hz)
     complex_poles, wave_number = (
-        np.exp(upper_poles[represented] / rate_hz),
-        z[represented] / beam.length_m,
+        np.exp(upper_poles[is_represented] / rate_hz),
+        z[is_represented] / beam.length_m,
     )
     has_shear = noise.shear_n is not None
     channel_count = 2 if has_shear else 1
@@ -506,7 +511,7 @@ def _design_observer(
     )
     q[zero_states] = noise_variances[:channel_count] * (_ZERO_BANDWIDTH_RAD_S / rate_hz) ** 2
     if has_shear:
-        c[1, even_states] = root_shear_ratio(_OBSERVED_MODES)[represented] * wave_number
+        c[1, even_states] = root_shear_ratio(_OBSERVED_MODE_COUNT)[is_represented] * wave_number
     measured_rows = c[:channel_count]
     r = np.diag(noise_variances[:channel_count])
     covariance = solve_discrete_are(a.T, measured_rows.T, np.diag(q), r)

@@ -25,11 +25,11 @@ from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 RealArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-DECAY_EXPONENT = 14.0
+TRANSFORM_DECAY_EXPONENT = 14.0
 """Exponent by which the transforms damp signals over their period; values that wrap round from the
 end of the period are reduced to 1e-6."""
 
-_OVERSAMPLING = 2
+_TRANSFORM_OVERSAMPLING = 2
 """Number of steps of the inverse transform per step of the kernels. Two suffice, because the
 spectrum of a hat is small at higher frequencies."""
 
@@ -52,9 +52,9 @@ class ForcePulse:
         from scipy.fft import next_fast_len
 
         self._steps = step_count
-        fine_step_s = step_s / _OVERSAMPLING
-        fine_steps = next_fast_len(2 * _OVERSAMPLING * step_count, real=True)
-        self.transform = CausalTransform(fine_steps, 1 / fine_step_s, DECAY_EXPONENT)
+        fine_step_s = step_s / _TRANSFORM_OVERSAMPLING
+        fine_steps = next_fast_len(2 * _TRANSFORM_OVERSAMPLING * step_count, real=True)
+        self.transform = CausalTransform(fine_steps, 1 / fine_step_s, TRANSFORM_DECAY_EXPONENT)
         s = self.transform.s
         pulse_transform = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
         # Two steps later than the force, so that the hat begins within the period.
@@ -66,10 +66,12 @@ class ForcePulse:
         The transfer functions from force, shape (k, points), are given at the points `s` of the
         transform.
         """
-        fine_values = self.transform.inverse(
-            self._delayed_pulse * laplace_response, _OVERSAMPLING * (self._steps + 1)
+        oversampled_kernels = self.transform.inverse(
+            self._delayed_pulse * laplace_response, _TRANSFORM_OVERSAMPLING * (self._steps + 1)
         )
-        return fine_values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
+        return oversampled_kernels[:, _TRANSFORM_OVERSAMPLING::_TRANSFORM_OVERSAMPLING][
+            :, : self._steps
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,26 +82,26 @@ class ContactKernels:
     """Positions of the force along the beam, shape (m,)."""
     step_s: float
     """Time step of the kernels, which is half the width of the pulse."""
-    displacement: RealArray
+    displacement_m_per_n: RealArray
     """Displacement at the position of the force in m/N, shape (m, n), from the peak of the pulse
     on."""
-    torque: RealArray
+    torque_nm_per_n: RealArray
     """Coupling torque in N·m/N, shape (m, n)."""
-    shear: RealArray
+    shear_per_n: RealArray
     """Base shear in N/N, shape (m, n)."""
 
     @property
-    def steps(self) -> int:
+    def step_count(self) -> int:
         """Number of time steps of the responses."""
-        return int(self.displacement.shape[1])
+        return int(self.displacement_m_per_n.shape[1])
 
     def at_positions(self, x_m: RealArray, step_count: int) -> "ContactKernels":
         """Return the responses at positions within the present range, by cubic interpolation."""
         first_rows, weights = cubic_weights(x_m, self.x_m)
         kernel_tables = (
-            self.displacement[:, :step_count],
-            self.torque[:, :step_count],
-            self.shear[:, :step_count],
+            self.displacement_m_per_n[:, :step_count],
+            self.torque_nm_per_n[:, :step_count],
+            self.shear_per_n[:, :step_count],
         )
         return ContactKernels(
             x_m, self.step_s, *(interpolate_rows(t, first_rows, weights) for t in kernel_tables)
@@ -114,7 +116,7 @@ class ContactKernels:
             1 - np.abs(np.arange(1 - widening_factor, widening_factor)) / widening_factor
         )
         wide_tables = []
-        for kernel_table in (self.displacement, self.torque, self.shear):
+        for kernel_table in (self.displacement_m_per_n, self.torque_nm_per_n, self.shear_per_n):
             padded_table = np.pad(
                 kernel_table, ((0, 0), (widening_factor - 1, widening_factor - 1))
             )
@@ -152,8 +154,8 @@ def contact_kernels(
     filter_response = sensor_filter.response(s)
     complex_stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     kernel_tables = np.empty((3, x_m.size, step_count))
-    for i in range(0, x_m.size, _POSITIONS_AT_ONCE):
-        x = x_m[i : i + _POSITIONS_AT_ONCE]
+    for i in range(0, x_m.size, _POSITIONS_PER_BLOCK):
+        x = x_m[i : i + _POSITIONS_PER_BLOCK]
         responses = (
             force_grid.displacement_per_force(x, x).T,
             -filter_response * force_grid.displacement_per_angle(x).T,
@@ -162,7 +164,7 @@ def contact_kernels(
             * force_grid.displacement_per_force(np.zeros_like(x), x, 3).T,
         )
         for kernel_table, laplace_response in zip(kernel_tables, responses, strict=True):
-            kernel_table[i : i + _POSITIONS_AT_ONCE] = force_pulse.kernels(laplace_response)
+            kernel_table[i : i + _POSITIONS_PER_BLOCK] = force_pulse.kernels(laplace_response)
     return ContactKernels(x_m, step_s, *kernel_tables)
 
 
@@ -181,13 +183,16 @@ class CrossKernels:
     """Response over time of each mode to the pulse, for mode shapes of 1 at both positions, in m/N;
     shape (modes, n)."""
 
-    def between_positions(self, x_m: RealArray, other_m: RealArray, step_count: int) -> RealArray:
+    def between_positions(
+        self, x_m: RealArray, second_positions_m: RealArray, step_count: int
+    ) -> RealArray:
         """Return the displacement in m/N for each pair of positions, shape (k, step_count).
 
         It is symmetric in the positions of force and displacement.
         """
         first_shapes, second_shapes = (
-            interpolate_rows(self.mode_shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
+            interpolate_rows(self.mode_shapes, *cubic_weights(x, self.x_m))
+            for x in (x_m, second_positions_m)
         )
         cross_kernels_of_pairs: RealArray = (first_shapes * second_shapes) @ self.kernels[
             :, :step_count
@@ -208,23 +213,23 @@ def cross_kernels(
     stiffness_factor = 1 + damping.zeta * s**damping.alpha
     wave_numbers = clamped_free_eigenvalues(_CROSS_MODE_COUNT) / beam.length_m
     stiffness_scale = beam.bending_stiffness_n_m2 * beam.length_m
-    per_force = 1 / (
+    mode_response_per_force = 1 / (
         stiffness_scale * (inertial_factor + stiffness_factor * wave_numbers[:, None] ** 4)
     )
     mode_shapes = np.stack(
         [mode_shape(i + 1, x_m / beam.length_m) for i in range(_CROSS_MODE_COUNT)], axis=1
     )
-    return CrossKernels(x_m, mode_shapes, force_pulse.kernels(per_force))
+    return CrossKernels(x_m, mode_shapes, force_pulse.kernels(mode_response_per_force))
 
 
-_POSITIONS_AT_ONCE = 8
+_POSITIONS_PER_BLOCK = 8
 """Number of positions that are evaluated at once, so that temporary arrays stay in the cache."""
 
 
 def beam_positions(length_m: float, spacing_m: float) -> RealArray:
     """Return equally spaced positions in m up to the tip of the beam, at most `spacing_m` apart."""
-    n = int(np.ceil((length_m - _FIRST_POSITION_M) / spacing_m)) + 1
-    return np.linspace(_FIRST_POSITION_M, length_m, n)
+    position_count = int(np.ceil((length_m - _FIRST_POSITION_M) / spacing_m)) + 1
+    return np.linspace(_FIRST_POSITION_M, length_m, position_count)
 
 
 def chebyshev_nodes(x_m: RealArray, node_count: int) -> tuple[RealArray, RealArray]:

@@ -9,7 +9,7 @@ from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS, Plant
 from rigd.identified_beam import TOUCH_USE, read_identified_beam
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
-_ASSUMED_RELATIVE_STD: Final = {
+_ASSUMED_RELATIVE_STDS: Final = {
     "bending_stiffness_n_m2": 0.01,
     "density_over_stiffness": 0.01,
     "zeta": 0.2,
@@ -19,7 +19,7 @@ _ASSUMED_RELATIVE_STD: Final = {
 identified."""
 
 
-_LARGEST_ORDER: Final = 1.99
+_MAX_DAMPING_ORDER: Final = 1.99
 """Largest fractional order of damping in a model with a changed parameter."""
 
 
@@ -45,12 +45,12 @@ class TouchModel:
         """Delay of torque and shear in s, without that of averaging the sensor's records."""
         return self.angle_delay_s + self.plant.delay_s - self.sensor_filter.weights_delay_s
 
-    def with_changed_parameter(self, name: str, parameter_change: float) -> "TouchModel":
+    def with_changed_parameter(self, parameter_name: str, parameter_change: float) -> "TouchModel":
         """Return the model with a difference added to one parameter, limited to valid values.
 
         Parameters
         ----------
-        name
+        parameter_name
             Name of the parameter, such as ``zeta``.
         parameter_change
             Difference that is added, in the unit of the parameter.
@@ -60,12 +60,12 @@ class TouchModel:
         ValueError
             If a plant has no parameter of that name.
         """
-        changed_value = self.plant.parameters.get(name, 0.0) + parameter_change
-        if name in DAMPING_PARAMETERS:
+        changed_value = self.plant.parameters.get(parameter_name, 0.0) + parameter_change
+        if parameter_name in DAMPING_PARAMETERS:
             changed_value = max(changed_value, 0.0)
-        if name in COEFFICIENT_OF:
-            changed_value = min(changed_value, _LARGEST_ORDER)
-        return replace(self, plant=self.plant.with_parameters({name: changed_value}))
+        if parameter_name in COEFFICIENT_OF:
+            changed_value = min(changed_value, _MAX_DAMPING_ORDER)
+        return replace(self, plant=self.plant.with_parameters({parameter_name: changed_value}))
 
     @classmethod
     def assumed(
@@ -91,7 +91,7 @@ class TouchModel:
             sensor_filter,
             std={
                 parameter_name: relative_std * parameter_values[parameter_name]
-                for parameter_name, relative_std in _ASSUMED_RELATIVE_STD.items()
+                for parameter_name, relative_std in _ASSUMED_RELATIVE_STDS.items()
             },
         )
 
@@ -121,11 +121,11 @@ class TouchModel:
             If the file cannot be read, lacks the beam's stiffness or density, has an effect that a
             uniform beam on a rigid clamp does not have, or marks a required number as doubtful.
         """
-        identified = read_identified_beam(path, stated_plant, TOUCH_USE)
+        identified_beam = read_identified_beam(path, stated_plant, TOUCH_USE)
         return cls(
-            identified.plant,
+            identified_beam.plant,
             angle_delay_s,
             sensor_filter,
             source=str(path),
-            std=identified.parameter_stds,
+            std=identified_beam.parameter_stds,
         )

@@ -29,7 +29,7 @@ MAX_LN_STIFFNESS = log(1e6)
 MIN_LN_STIFFNESS = log(10.0)
 """Logarithm of the smallest stiffness of an obstacle in N/m."""
 
-Prediction = Callable[[RealArray, "WhitenedWindow"], RealArray]
+EffectPredictor = Callable[[RealArray, "WhitenedWindow"], RealArray]
 """Function that predicts the effects (k, c, samples) of candidates (k, p) on torque and base shear
 in a window of samples."""
 
@@ -38,9 +38,9 @@ in a window of samples."""
 class ParameterRanges:
     """Bounds and step sizes of the p parameters of one kind of obstacle; arrays of shape (p,)."""
 
-    low: RealArray
+    lower_limits: RealArray
     """Smallest value of each parameter."""
-    high: RealArray
+    upper_limits: RealArray
     """Largest value of each parameter."""
     derivative_step: RealArray
     """Change of each parameter for a numerical derivative."""
@@ -62,10 +62,10 @@ class WhitenedWindow:
     """Index of the first sample."""
     end_sample: int
     """Index of the sample after the last."""
-    whitening: RealArray
+    whitening_matrix: RealArray
     """Inverse Cholesky factor of the covariance that noise and uncertainties cause, shape (n,
     n)."""
-    data: RealArray
+    whitened_innovations: RealArray
     """Whitened innovations of torque and base shear, shape (n,)."""
 
     @classmethod
@@ -106,7 +106,11 @@ class WhitenedWindow:
         """
         noise_stds, whitening, whitened_data = (
             float_array.astype(predicted_effects.dtype, copy=False)
-            for float_array in (self.motion.noise_stds, self.whitening, self.data)
+            for float_array in (
+                self.motion.noise_stds,
+                self.whitening_matrix,
+                self.whitened_innovations,
+            )
         )
         scaled_predictions = (predicted_effects / noise_stds[:, None]).reshape(
             predicted_effects.shape[0], -1
@@ -144,14 +148,14 @@ class ObstacleContact:
         free_motion = self._motion
         x, instants_s = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
-        time_steps = self.step_count(instants_s, sample_window)
-        local_kernels = self._kernels.at_positions(x, time_steps) if kernels is None else kernels
+        step_count = self.step_count(instants_s, sample_window)
+        local_kernels = self._kernels.at_positions(x, step_count) if kernels is None else kernels
         approaches_m, pressing_signs = self.motion_beyond_obstacle(
-            x, instants_s, time_steps, pressing_sign
+            x, instants_s, step_count, pressing_sign
         )
         motion_parameters = parameters[:, 3:].T
         pressing_force_n = integrate_contact(
-            np.broadcast_to(local_kernels.displacement[:, :time_steps], approaches_m.shape),
+            np.broadcast_to(local_kernels.displacement_m_per_n[:, :step_count], approaches_m.shape),
             approaches_m,
             np.exp(parameters[:, 2]),
             step_s,
@@ -159,7 +163,7 @@ class ObstacleContact:
             *motion_parameters[1:2],
         )
         forces_n = -pressing_signs[:, None] * pressing_force_n
-        kernel_tables = (local_kernels.torque, local_kernels.shear)[
+        kernel_tables = (local_kernels.torque_nm_per_n, local_kernels.shear_per_n)[
             : free_motion.innovations.shape[0]
         ]
         return self.force_effects(kernel_tables, forces_n, instants_s, sample_window), forces_n
@@ -178,24 +182,24 @@ class ObstacleContact:
         at the time steps of the free motion, shape (r, steps).
         """
         x, instant_s = parameters[:1], parameters[1:2]
-        time_steps = self.step_count(instant_s, sample_window)
-        local_kernels = self._kernels.at_positions(x, time_steps)
-        approach_m, pressing_sign = self.motion_beyond_obstacle(x, instant_s, time_steps)
+        step_count = self.step_count(instant_s, sample_window)
+        local_kernels = self._kernels.at_positions(x, step_count)
+        approach_m, pressing_sign = self.motion_beyond_obstacle(x, instant_s, step_count)
         repeated_instants_s = np.repeat(instant_s, len(displacement_changes_m))
         added_approach_m = pressing_sign * self._interpolate_to_steps(
-            displacement_changes_m, repeated_instants_s, time_steps
+            displacement_changes_m, repeated_instants_s, step_count
         )
         all_approaches = np.vstack(
             [approach_m, approach_m + added_approach_m - added_approach_m[:, :1]]
         )
         stiffnesses_n_per_m = np.full((1, len(all_approaches)), np.exp(parameters[2]))
         pressing_force_n = integrate_contact(
-            local_kernels.displacement,
+            local_kernels.displacement_m_per_n,
             all_approaches[None],
             stiffnesses_n_per_m,
             self._kernels.step_s,
         )[0]
-        kernel_tables = (local_kernels.torque, local_kernels.shear)[
+        kernel_tables = (local_kernels.torque_nm_per_n, local_kernels.shear_per_n)[
             : self._motion.innovations.shape[0]
         ]
         return self.force_effects(
@@ -208,11 +212,11 @@ class ObstacleContact:
     def step_count(self, instants_s: RealArray, sample_window: WhitenedWindow) -> int:
         """Return the number of time steps from the earliest touch to the end of the window."""
         step_s = self._kernels.step_s
-        needed_steps = (
+        required_step_count = (
             int(np.ceil((self._motion.t[sample_window.end_sample - 1] - instants_s.min()) / step_s))
             + 3
         )
-        return min(max(needed_steps, 4), self._kernels.steps)
+        return min(max(required_step_count, 4), self._kernels.step_count)
 
     def pressing_sign(self, parameters: RealArray) -> float:
         """Return the direction of the free beam's motion at the touch of one candidate, 1 or -1."""
@@ -245,8 +249,8 @@ class ObstacleContact:
         self,
         positions_m: RealArray,
         instants_s: RealArray,
-        steps: int,
-        given_sign: float | None = None,
+        step_count: int,
+        given_pressing_sign: float | None = None,
     ) -> tuple[RealArray, RealArray]:
         """Return the free beam's distance beyond each obstacle over time, and its direction.
 
@@ -257,28 +261,30 @@ class ObstacleContact:
         free_motion = self._motion
         first_rows, weights = cubic_weights(positions_m, self._x_m)
         displacement_m = interpolate_rows(free_motion.displacement_m, first_rows, weights)
-        free_motion_m = self._interpolate_to_steps(displacement_m, instants_s, steps)
-        if given_sign is None:
+        free_motion_m = self._interpolate_to_steps(displacement_m, instants_s, step_count)
+        if given_pressing_sign is None:
             position_before_m = shift_rows(
                 displacement_m, (instants_s - free_motion.first_s) / free_motion.step_s - 1.0, 1
             )
             pressing_signs = np.where(free_motion_m[:, 0] >= position_before_m[:, 0], 1.0, -1.0)
         else:
-            pressing_signs = np.full(positions_m.size, given_sign)
+            pressing_signs = np.full(positions_m.size, given_pressing_sign)
         return pressing_signs[:, None] * (free_motion_m - free_motion_m[:, :1]), pressing_signs
 
     def _interpolate_to_steps(
-        self, displacement_m: RealArray, instants_s: RealArray, steps: int
+        self, displacement_m: RealArray, instants_s: RealArray, step_count: int
     ) -> RealArray:
         """Return displacements at the time steps of the contact, each row from its instant on."""
         free_motion = self._motion
         begin_steps = (instants_s - free_motion.first_s) / free_motion.step_s
         substeps = max(1, round(free_motion.step_s / self._kernels.step_s))
-        interpolated_m = np.empty((begin_steps.size, substeps * -(-steps // substeps)))
+        interpolated_m = np.empty((begin_steps.size, substeps * -(-step_count // substeps)))
         for i in range(substeps):
-            substep = interpolated_m[:, i::substeps]
-            substep[:] = shift_rows(displacement_m, begin_steps + i / substeps, substep.shape[1])
-        return interpolated_m[:, :steps]
+            substep_columns = interpolated_m[:, i::substeps]
+            substep_columns[:] = shift_rows(
+                displacement_m, begin_steps + i / substeps, substep_columns.shape[1]
+            )
+        return interpolated_m[:, :step_count]
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,19 +305,21 @@ increases, the reduction predicted by the linearised model is compared."""
 
 
 def find_minima(
-    predict_effect: Prediction,
+    predict_effect: EffectPredictor,
     sample_window: WhitenedWindow,
     start_candidates: RealArray,
     parameter_ranges: ParameterRanges,
     max_iterations: int = 12,
-    free_parameters: NDArray[np.bool_] | None = None,
+    is_free_parameter: NDArray[np.bool_] | None = None,
 ) -> LocalMinima:
     """Return the local minima of the sum of squared residuals that are reached from given starts.
 
-    Starts have the shape (k, p). `free_parameters` states whether each parameter of each start is
+    Starts have the shape (k, p). `is_free_parameter` states whether each parameter of each start is
     varied, shape (k, p); by default all are.
     """
-    best_parameters = np.clip(start_candidates, parameter_ranges.low, parameter_ranges.high)
+    best_parameters = np.clip(
+        start_candidates, parameter_ranges.lower_limits, parameter_ranges.upper_limits
+    )
     damping_factors = np.full(len(best_parameters), 1e-2)
     current_residuals, jacobians = _linearise(
         predict_effect, sample_window, best_parameters, parameter_ranges
@@ -322,8 +330,8 @@ def find_minima(
     for _ in range(max_iterations):
         active_rows = np.flatnonzero(is_active)
         j, r = jacobians[active_rows], current_residuals[active_rows]
-        if free_parameters is not None:
-            j = j * free_parameters[active_rows, None]
+        if is_free_parameter is not None:
+            j = j * is_free_parameter[active_rows, None]
         normal_matrices = np.einsum("knp,knq->kpq", j, j)
         gradients = np.einsum("knp,kn->kp", j, r)
         normal_diagonals = (
@@ -339,8 +347,8 @@ def find_minima(
         )
         trial_parameters = np.clip(
             best_parameters[active_rows] + parameter_steps,
-            parameter_ranges.low,
-            parameter_ranges.high,
+            parameter_ranges.lower_limits,
+            parameter_ranges.upper_limits,
         )
         predicted_residual = r + np.einsum(
             "knp,kp->kn", j, trial_parameters - best_parameters[active_rows]
@@ -378,7 +386,7 @@ def find_minima(
 
 
 def _linearise(
-    predict_effect: Prediction,
+    predict_effect: EffectPredictor,
     sample_window: WhitenedWindow,
     current_candidates: RealArray,
     parameter_ranges: ParameterRanges,
@@ -386,7 +394,7 @@ def _linearise(
     """Return the candidates' residuals (k, n) and the derivatives by their parameters (k, n, p)."""
     parameter_count = current_candidates.shape[1]
     parameter_shifts = np.where(
-        current_candidates + parameter_ranges.derivative_step > parameter_ranges.high,
+        current_candidates + parameter_ranges.derivative_step > parameter_ranges.upper_limits,
         -parameter_ranges.derivative_step,
         parameter_ranges.derivative_step,
     )
@@ -436,9 +444,9 @@ class CandidateGrid:
         time_steps = self._steps_per_sample * sample_count
         self._x_m = kernels.x_m[::position_stride]
         # Single precision suffices for choosing starts, and is twice as fast.
-        self._displacement_kernels = kernels.displacement[::position_stride, :time_steps].astype(
-            np.float32
-        )
+        self._displacement_kernels = kernels.displacement_m_per_n[
+            ::position_stride, :time_steps
+        ].astype(np.float32)
         lag_steps = self._steps_per_sample * np.arange(sample_count)[:, None] - np.arange(
             time_steps
         )
@@ -448,7 +456,7 @@ class CandidateGrid:
             )
             .transpose(0, 2, 1)
             .astype(np.float32)
-            for kernel_table in (kernels.torque, kernels.shear)
+            for kernel_table in (kernels.torque_nm_per_n, kernels.shear_per_n)
         ]  # (positions, steps, samples)
 
     def integrate(
@@ -470,17 +478,20 @@ class CandidateGrid:
         return np.stack(grid_axes, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
     def _sums_of_squared_residuals(
-        self, free_motion: FreeMotion, sample_window: WhitenedWindow, samples: NDArray[np.intp]
+        self,
+        free_motion: FreeMotion,
+        sample_window: WhitenedWindow,
+        sample_indices: NDArray[np.intp],
     ) -> RealArray:
-        """Return the sums of squared residuals of the candidates whose touch begins at `samples`.
+        """Return the sums of squared residuals of the candidates that touch at given samples.
 
         The shape is (positions, samples, stiffnesses).
         """
         position_count, stiffness_count = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
-        sample_count = sample_window.end_sample - int(samples[0])
+        sample_count = sample_window.end_sample - int(sample_indices[0])
         time_steps = self._steps_per_sample * sample_count
         begin_steps = np.round(
-            (free_motion.t[samples] - free_motion.first_s) / free_motion.step_s
+            (free_motion.t[sample_indices] - free_motion.first_s) / free_motion.step_s
         ).astype(np.intp)
         step_columns = begin_steps[:, None] + np.arange(-1, time_steps)
         last_column = free_motion.displacement_m.shape[1] - 1
@@ -497,14 +508,16 @@ class CandidateGrid:
         pressing_force_n = integrate_contact(
             self._displacement_kernels[:, :time_steps],
             np.repeat(approaches_m, stiffness_count, axis=1),
-            np.tile(GRID_STIFFNESSES_N_PER_M.astype(np.float32), (position_count, samples.size)),
+            np.tile(
+                GRID_STIFFNESSES_N_PER_M.astype(np.float32), (position_count, sample_indices.size)
+            ),
             self._step_s,
         )
         forces_n = -np.repeat(pressing_signs, stiffness_count, axis=1) * pressing_force_n
         predicted_effects = np.zeros(
             (
                 position_count,
-                samples.size,
+                sample_indices.size,
                 stiffness_count,
                 free_motion.noise_stds.size,
                 sample_window.end_sample - sample_window.first_sample,
@@ -516,9 +529,9 @@ class CandidateGrid:
                 forces_n @ self._lag_kernels[channel_index][:, :time_steps, :sample_count]
             )
             channel_effect = channel_effect.reshape(
-                position_count, samples.size, stiffness_count, sample_count
+                position_count, sample_indices.size, stiffness_count, sample_count
             )
-            for i, touch_sample in enumerate(samples):
+            for i, touch_sample in enumerate(sample_indices):
                 later_samples = sample_window.end_sample - touch_sample
                 predicted_effects[:, i, :, channel_index, -later_samples:] = channel_effect[
                     :, i, :, :later_samples
@@ -527,7 +540,7 @@ class CandidateGrid:
             predicted_effects.reshape(-1, *predicted_effects.shape[3:])
         )
         chi2: RealArray = np.einsum("kn,kn->k", sample_residuals, sample_residuals)
-        return chi2.reshape(position_count, samples.size, stiffness_count)
+        return chi2.reshape(position_count, sample_indices.size, stiffness_count)
 
 
 _INSTANTS_AT_ONCE = 16
@@ -537,7 +550,7 @@ GRID_STIFFNESSES_N_PER_M = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 10000
 
 
 def chi2_of(
-    predict_effect: Prediction, sample_window: WhitenedWindow, candidates: RealArray
+    predict_effect: EffectPredictor, sample_window: WhitenedWindow, candidates: RealArray
 ) -> RealArray:
     """Return the sum of squared residuals of each candidate obstacle, shape (k,)."""
     candidate_residuals = sample_window.residuals(predict_effect(candidates, sample_window))

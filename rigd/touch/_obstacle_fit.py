@@ -11,10 +11,10 @@ from rigd.touch._free_motion import TouchRecord
 from rigd.touch._obstacle_contact import (
     MAX_LN_STIFFNESS,
     MIN_LN_STIFFNESS,
+    EffectPredictor,
     LocalMinima,
     ObstacleContact,
     ParameterRanges,
-    Prediction,
     WhitenedWindow,
     chi2_of,
     find_minima,
@@ -23,7 +23,7 @@ from rigd.touch._pair import TwoObstacleContact
 from rigd.touch._posterior import Posterior, sample_posterior
 from rigd.touch._tables import TouchTables
 from rigd.touch._uncertainty_effects import uncertainty_effects
-from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
+from rigd.touch.samples import FINAL_ESTIMATE_S, FIRST_ESTIMATE_S, RECORD_BEFORE_DETECTION_S
 
 RealArray = NDArray[np.float64]
 
@@ -76,9 +76,12 @@ class ObstacleFit:
     ) -> None:
         rate_hz = touch_tables.rate_hz
         self.tables, self.rate_hz = touch_tables, rate_hz
-        self.record_offset = max(0, touch_record.detected - round(HISTORY_S * rate_hz))
+        self.record_offset = max(
+            0, touch_record.detection_index - round(RECORD_BEFORE_DETECTION_S * rate_hz)
+        )
         record_end = min(
-            touch_record.angle_rad.size, touch_record.detected + round(FINAL_S * rate_hz)
+            touch_record.angle_rad.size,
+            touch_record.detection_index + round(FINAL_ESTIMATE_S * rate_hz),
         )
         self.record = TouchRecord(
             rate_hz,
@@ -87,14 +90,14 @@ class ObstacleFit:
             None
             if touch_record.shear_n is None
             else touch_record.shear_n[self.record_offset : record_end],
-            touch_record.detected - self.record_offset,
+            touch_record.detection_index - self.record_offset,
         )
-        self.detected = self.record.detected
-        self.quiet_samples = self.detected - round(detection_delay_s * rate_hz)
+        self.detection_index = self.record.detection_index
+        self.quiet_samples = self.detection_index - round(detection_delay_s * rate_hz)
         self.motion = touch_tables.free_beam.motion(
             self.record, self.quiet_samples, self.quiet_samples - 4
         )
-        self.samples_after_detection = self.record.angle_rad.size - self.detected
+        self.samples_after_detection = self.record.angle_rad.size - self.detection_index
         self.position_range_m = (float(touch_tables.x_m[0]) + 0.002, float(touch_tables.x_m[-1]))
         self.effects_per_std: RealArray | None = None
         self._uncertainties_end_s = 0.0
@@ -110,7 +113,7 @@ class ObstacleFit:
 
         Computing it takes as long as the rest of the estimate.
         """
-        return self.tables.any_force_estimator.scan(self.window(FIRST_S))
+        return self.tables.any_force_estimator.scan(self.window(FIRST_ESTIMATE_S))
 
     def pressing_sign(self) -> float:
         """Return the direction in which the beam presses on the obstacle, 1 or -1.
@@ -121,39 +124,41 @@ class ObstacleFit:
 
     # Data for the comparison of candidates
 
-    def window(self, after_detection_s: float) -> WhitenedWindow:
+    def window(self, time_after_detection_s: float) -> WhitenedWindow:
         """Return the whitened innovations of the samples up to a time after the detection."""
         return WhitenedWindow.from_motion(
             self.motion,
             self.quiet_samples,
-            self.sample_after_detection(after_detection_s),
+            self.sample_after_detection(time_after_detection_s),
             self.effects_per_std,
         )
 
-    def sample_after_detection(self, after_detection_s: float) -> int:
+    def sample_after_detection(self, time_after_detection_s: float) -> int:
         """Return the index of the sample at a time after the detection, limited to the record."""
-        return self.detected + min(
-            self.samples_after_detection, round(after_detection_s * self.rate_hz)
+        return self.detection_index + min(
+            self.samples_after_detection, round(time_after_detection_s * self.rate_hz)
         )
 
-    def include_uncertainties(self, likely_obstacle: RealArray, after_detection_s: float) -> None:
+    def include_uncertainties(
+        self, likely_obstacle: RealArray, time_after_detection_s: float
+    ) -> None:
         """Compute the effects of uncertainties on the samples up to a time after the detection.
 
         Only the first candidate of `likely_obstacle` is used. Effects that were computed before, up
-        to `after_detection_s` or later, remain.
+        to `time_after_detection_s` or later, remain.
         """
-        if self._uncertainties_end_s < after_detection_s:
+        if self._uncertainties_end_s < time_after_detection_s:
             self._uncertainties_end_s = min(
-                max(after_detection_s, UNCERTAINTIES_END_S),
+                max(time_after_detection_s, UNCERTAINTIES_END_S),
                 self.samples_after_detection / self.rate_hz,
             )
-            whole_window = WhitenedWindow.from_motion(
+            record_window = WhitenedWindow.from_motion(
                 self.motion,
                 self.quiet_samples,
                 self.sample_after_detection(self._uncertainties_end_s),
             )
             self.effects_per_std = uncertainty_effects(
-                self.tables, self.record, likely_obstacle[:1], whole_window
+                self.tables, self.record, likely_obstacle[:1], record_window
             )
 
     def parameter_ranges(self, parameter_count: int) -> ParameterRanges:
@@ -164,7 +169,7 @@ class ObstacleFit:
                 [self.position_range_m[0], t[self.quiet_samples + 1], MIN_LN_STIFFNESS, -3.0, 0.0]
             )[:parameter_count],
             high=np.array(
-                [self.position_range_m[1], t[self.detected], MAX_LN_STIFFNESS, 3.0, 50.0]
+                [self.position_range_m[1], t[self.detection_index], MAX_LN_STIFFNESS, 3.0, 50.0]
             )[:parameter_count],
             derivative_step=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:parameter_count],
             significant_change=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:parameter_count],
@@ -172,11 +177,13 @@ class ObstacleFit:
             largest_std=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:parameter_count],
         )
 
-    def predictor(self, near_candidates: RealArray, *, coarse: bool = False) -> Prediction:
+    def predictor(
+        self, near_candidates: RealArray, *, uses_coarse_kernels: bool = False
+    ) -> EffectPredictor:
         """Return the function that predicts the effects of obstacles near `near_candidates`.
 
         The function integrates with fine time steps if the candidates are near the tip. Otherwise
-        the steps are of medium length, or long with `coarse` set.
+        the steps are of medium length, or long with `uses_coarse_kernels` set.
         """
         tables = self.tables
         is_near_tip = bool(
@@ -186,7 +193,7 @@ class ObstacleFit:
             tables.fine_kernels
             if is_near_tip
             else tables.coarse_kernels
-            if coarse
+            if uses_coarse_kernels
             else tables.middle_kernels
         )
         obstacle_contact = ObstacleContact(kernels, tables.x_m, self.motion)
@@ -203,7 +210,7 @@ class ObstacleFit:
     def explain_by_kind(
         self,
         kind: str,
-        predict_effect: Prediction,
+        predict_effect: EffectPredictor,
         sample_window: WhitenedWindow,
         start_candidates: RealArray,
         parameter_ranges: ParameterRanges,
@@ -223,7 +230,7 @@ class ObstacleFit:
     def explain_from_minima(
         self,
         kind: str,
-        predict_effect: Prediction,
+        predict_effect: EffectPredictor,
         sample_window: WhitenedWindow,
         local_minima: LocalMinima,
         parameter_ranges: ParameterRanges,
@@ -245,14 +252,14 @@ class ObstacleFit:
                 for k in near_best_indices
             ]
         )
-        degrees = max(sample_window.data.size - parameter_count, 1)
+        degrees_of_freedom = max(sample_window.whitened_innovations.size - parameter_count, 1)
         posterior = sample_posterior(
-            lambda rows: chi2_of(predict_effect, sample_window, rows),
+            lambda candidates: chi2_of(predict_effect, sample_window, candidates),
             local_minima.parameters[near_best_indices],
             covariances,
-            (parameter_ranges.low, parameter_ranges.high),
+            (parameter_ranges.lower_limits, parameter_ranges.upper_limits),
             residual_variance=variance_factor
-            * max(_MIN_RESIDUAL_VARIANCE, local_minima.chi2.min() / degrees),
+            * max(_MIN_RESIDUAL_VARIANCE, local_minima.chi2.min() / degrees_of_freedom),
             samples_per_round=120,
             max_rounds=5,
             sufficient_samples=150.0,
@@ -273,7 +280,9 @@ class ObstacleFit:
 
         Their sum of squares may exceed its expectation by `max_stds` standard deviations.
         """
-        return bool(explanation.chi2 < self.max_chi2(sample_window.data.size, max_stds))
+        return bool(
+            explanation.chi2 < self.max_chi2(sample_window.whitened_innovations.size, max_stds)
+        )
 
     def max_chi2(self, expected_chi2: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
         """Return the largest sum of squared residuals that noise explains.

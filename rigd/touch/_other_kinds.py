@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from rigd.touch._impact import ImpactResponse
 from rigd.touch._kernels import ContactKernels
 from rigd.touch._obstacle_contact import (
+    EffectPredictor,
     ObstacleContact,
     ParameterRanges,
-    Prediction,
     WhitenedWindow,
     chi2_of,
     find_minima,
@@ -16,7 +16,7 @@ from rigd.touch._obstacle_contact import (
 from rigd.touch._obstacle_fit import UNCERTAINTIES_END_S, Explanation, ObstacleFit
 from rigd.touch._pair import TwoObstacleContact
 from rigd.touch._tables import GRID_COMPARISON_S
-from rigd.touch.samples import FIRST_S
+from rigd.touch.samples import FIRST_ESTIMATE_S
 
 RealArray = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ def may_move_or_yield(
             motion_parameters,
         ]
     )
-    is_free = np.hstack(
+    is_free_parameter = np.hstack(
         [
             np.ones((len(motion_parameters), resting_explanation.parameters.size), dtype=bool),
             motion_parameters != 0,
@@ -85,7 +85,7 @@ def may_move_or_yield(
         start_candidates,
         obstacle_fit.parameter_ranges(5),
         max_iterations=5,
-        free_parameters=is_free,
+        is_free_parameter=is_free_parameter,
     )
     return bool(minima.chi2.min() < resting_explanation.chi2 - CHANCE_CHI2_REDUCTION)
 
@@ -102,7 +102,7 @@ def explain_by_motion_or_impact(
         np.argsort(-any_force_likelihood.log_likelihood)[:24]
     ]
     touch_instants_s = obstacle_fit.motion.t[
-        obstacle_fit.quiet_samples + 2 : obstacle_fit.detected + 1 : 2
+        obstacle_fit.quiet_samples + 2 : obstacle_fit.detection_index + 1 : 2
     ]
     explanations = []
     for obstacle_kind, motion_values in (
@@ -120,7 +120,7 @@ def explain_by_motion_or_impact(
         coarse_predictor = _moving_predictor(
             obstacle_fit, obstacle_kind, obstacle_fit.tables.coarse_kernels, pressing_sign
         )
-        for comparison_s, candidate_count in ((GRID_COMPARISON_S, 80), (FIRST_S, 10)):
+        for comparison_s, candidate_count in ((GRID_COMPARISON_S, 80), (FIRST_ESTIMATE_S, 10)):
             chi2 = chi2_of(coarse_predictor, obstacle_fit.window(comparison_s), start_candidates)
             start_candidates = start_candidates[np.argsort(chi2)[:candidate_count]]
         predict_effect, parameter_ranges = (
@@ -129,10 +129,10 @@ def explain_by_motion_or_impact(
             ),
             _moving_parameter_ranges(obstacle_fit, obstacle_kind),
         )
-        if sample_window.end_sample > obstacle_fit.sample_after_detection(FIRST_S):
+        if sample_window.end_sample > obstacle_fit.sample_after_detection(FIRST_ESTIMATE_S):
             early_minima = find_minima(
                 predict_effect,
-                obstacle_fit.window(FIRST_S),
+                obstacle_fit.window(FIRST_ESTIMATE_S),
                 start_candidates,
                 parameter_ranges,
                 max_iterations=6,
@@ -148,11 +148,12 @@ def explain_by_motion_or_impact(
     )
     impact_response = ImpactResponse(obstacle_contact, obstacle_fit.tables.middle_kernels, 2)
     start_candidates = impact_response.start_candidates(
-        obstacle_fit.window(FIRST_S), obstacle_fit.detected, 10
+        obstacle_fit.window(FIRST_ESTIMATE_S), obstacle_fit.detection_index, 10
     )
     obstacle_ranges = obstacle_fit.parameter_ranges(3)
     parameter_ranges = impact_response.parameter_ranges(
-        obstacle_fit.position_range_m, (obstacle_ranges.low[1], obstacle_ranges.high[1])
+        obstacle_fit.position_range_m,
+        (obstacle_ranges.lower_limits[1], obstacle_ranges.upper_limits[1]),
     )
     explanations.append(
         obstacle_fit.explain_by_kind(
@@ -164,7 +165,7 @@ def explain_by_motion_or_impact(
 
 def _moving_predictor(
     obstacle_fit: ObstacleFit, kind: str, kernels: ContactKernels, pressing_sign: float
-) -> Prediction:
+) -> EffectPredictor:
     """Return the function that predicts the effects of moving or of yielding obstacles.
 
     The fourth parameter of its candidates is the speed, or for "yielding" the mobility.
@@ -184,8 +185,8 @@ def _moving_parameter_ranges(obstacle_fit: ObstacleFit, kind: str) -> ParameterR
     ranges = obstacle_fit.parameter_ranges(5)
     parameter_columns = [0, 1, 2, 3 if kind == "moving" else 4]
     return ParameterRanges(
-        ranges.low[parameter_columns],
-        ranges.high[parameter_columns],
+        ranges.lower_limits[parameter_columns],
+        ranges.upper_limits[parameter_columns],
         ranges.derivative_step[parameter_columns],
         ranges.significant_change[parameter_columns],
         ranges.smallest_std[parameter_columns],
@@ -196,7 +197,7 @@ def _moving_parameter_ranges(obstacle_fit: ObstacleFit, kind: str) -> ParameterR
 # Two obstacles
 
 
-def explain_by_two(
+def explain_by_two_obstacles(
     obstacle_fit: ObstacleFit, resting_explanation: Explanation, sample_window: WhitenedWindow
 ) -> tuple[Explanation | None, RealArray]:
     """Return the explanation by two obstacles, and possible positions in m of the first one.
@@ -232,8 +233,10 @@ def explain_by_two(
     start_chi2 = np.concatenate([minima.chi2, equivalent_chi2])
     if start_chi2.min() > single_chi2 - _MIN_EARLY_CHI2_REDUCTION:
         return None, first_obstacle_positions_m
-    likeliest = start_candidates[np.argsort(start_chi2)[:3]]
-    start_pairs = np.vstack([likeliest, two_contacts.in_reverse_order(likeliest[:1])])
+    likeliest_candidates = start_candidates[np.argsort(start_chi2)[:3]]
+    start_pairs = np.vstack(
+        [likeliest_candidates, two_contacts.reverse_obstacle_order(likeliest_candidates[:1])]
+    )
     minima = find_minima(
         two_contacts.predict_channels,
         sample_window,
@@ -267,23 +270,27 @@ def _equivalent_pairs(
 
     The shapes are (k, 6) and (k,); k = 0 if no pair has an effect similar to one obstacle.
     """
-    pairs = two_contacts.equivalent_pairs(resting_explanation.parameters, _RELATIVE_PAIR_POSITIONS)
-    pairs = pairs[(pairs[:, [0, 3]] <= parameter_ranges.high[0]).all(axis=1)]
+    obstacle_pairs = two_contacts.equivalent_pairs(
+        resting_explanation.parameters, _RELATIVE_PAIR_POSITIONS
+    )
+    obstacle_pairs = obstacle_pairs[
+        (obstacle_pairs[:, [0, 3]] <= parameter_ranges.upper_limits[0]).all(axis=1)
+    ]
     predict_effect = two_contacts.predict_channels
     if (
-        not pairs.size
-        or chi2_of(predict_effect, sample_window, pairs[:1])[0]
+        not obstacle_pairs.size
+        or chi2_of(predict_effect, sample_window, obstacle_pairs[:1])[0]
         > single_chi2 + _MAX_EQUIVALENT_CHI2_INCREASE
     ):
         return np.empty((0, 6)), np.empty(0)
-    is_free = np.ones(pairs.shape, dtype=bool)
-    is_free[:, 0] = False
+    is_free_parameter = np.ones(obstacle_pairs.shape, dtype=bool)
+    is_free_parameter[:, 0] = False
     minima = find_minima(
         predict_effect,
         sample_window,
-        pairs,
+        obstacle_pairs,
         parameter_ranges,
         max_iterations=8,
-        free_parameters=is_free,
+        is_free_parameter=is_free_parameter,
     )
     return minima.parameters, minima.chi2

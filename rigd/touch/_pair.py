@@ -22,7 +22,7 @@ RealArray = NDArray[np.float64]
 _SECOND_TOUCH_DELAYS_S = np.array([0.0, 0.008, 0.025, 0.06])
 """Times in s from the first to the second touch from which the search starts, if the first obstacle
 did not slow the beam."""
-_POSITION_COUNT = 12
+_TRIAL_POSITION_COUNT = 12
 """Number of positions of the second obstacle among which the search chooses its starts."""
 _TRIAL_STIFFNESS_N_PER_M = 100.0
 """Stiffness of the second obstacle for which first-order effects are computed; they are scaled in
@@ -30,7 +30,7 @@ proportion to the stiffness."""
 _RELATIVE_EQUIVALENT_POSITIONS = np.array([[0.6, 1.6], [0.8, 1.3], [0.6, 2.5]])
 """Positions of two obstacles with about the effect of one, divided by the position of the one. Each
 of the two exerts half of its moment."""
-_MAX_DISTANCE_M = 0.3
+_MAX_APPROACH_DISTANCE_M = 0.3
 """Largest distance in m from the free beam to the second obstacle at the first touch."""
 
 
@@ -73,7 +73,7 @@ class TwoObstacleContact:
             * (first_sign * second_sign)[:, None]
         )
         pressing_forces_n = integrate_two_contacts(
-            (local_kernels[0].displacement, local_kernels[1].displacement),
+            (local_kernels[0].displacement_m_per_n, local_kernels[1].displacement_m_per_n),
             local_cross_kernels,
             (beyond_first_m, beyond_second_m - parameters[:, 4:5]),
             (np.exp(parameters[:, 2]), np.exp(parameters[:, 5])),
@@ -85,7 +85,7 @@ class TwoObstacleContact:
         channel_count = sample_window.motion.noise_stds.size
         first_effect, second_effect = (
             obstacle_contact.force_effects(
-                (position_kernels.torque, position_kernels.shear)[:channel_count],
+                (position_kernels.torque_nm_per_n, position_kernels.shear_per_n)[:channel_count],
                 force_n,
                 instants_s,
                 sample_window,
@@ -148,20 +148,31 @@ class TwoObstacleContact:
 
         The likeliest ones are selected by the first-order effect of the second obstacle.
         """
-        x_m = np.linspace(parameter_ranges.low[3], parameter_ranges.high[3], _POSITION_COUNT)
-        instants_s = np.full(_POSITION_COUNT, single_obstacle[1])
+        x_m = np.linspace(
+            parameter_ranges.lower_limits[3],
+            parameter_ranges.upper_limits[3],
+            _TRIAL_POSITION_COUNT,
+        )
+        instants_s = np.full(_TRIAL_POSITION_COUNT, single_obstacle[1])
         step_count = self._contact.step_count(instants_s, sample_window)
         delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
         beyond_m, _ = self._contact.motion_beyond_obstacle(x_m, instants_s, step_count)
         distances_m = np.maximum(beyond_m[:, np.minimum(delay_steps, step_count - 1)], 0.0)
         trial_pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
-        with_second = np.tile(trial_pair, (_POSITION_COUNT * delay_steps.size, 1))
-        with_second[:, 3], with_second[:, 4] = np.repeat(x_m, delay_steps.size), distances_m.ravel()
-        without_second = np.concatenate(
-            [single_obstacle, [x_m[-1], parameter_ranges.high[4], MIN_LN_STIFFNESS]]
+        pairs_with_second = np.tile(trial_pair, (_TRIAL_POSITION_COUNT * delay_steps.size, 1))
+        pairs_with_second[:, 3], pairs_with_second[:, 4] = (
+            np.repeat(x_m, delay_steps.size),
+            distances_m.ravel(),
         )
-        changed_first = without_second + np.diag(parameter_ranges.derivative_step)[:3]
-        candidate_rows = np.vstack([without_second, changed_first, with_second])
+        pair_without_second = np.concatenate(
+            [single_obstacle, [x_m[-1], parameter_ranges.upper_limits[4], MIN_LN_STIFFNESS]]
+        )
+        pairs_with_changed_first = (
+            pair_without_second + np.diag(parameter_ranges.derivative_step)[:3]
+        )
+        candidate_rows = np.vstack(
+            [pair_without_second, pairs_with_changed_first, pairs_with_second]
+        )
         residuals = sample_window.residuals(self.predict_channels(candidate_rows, sample_window))
         residual_without_second, second_effects = residuals[0], residuals[4:] - residuals[0]
         # Effects that changes of the first obstacle can have are removed by projection.
@@ -176,12 +187,12 @@ class TwoObstacleContact:
         effect_factors = np.maximum(
             -(projected_effect @ residual_without_second) / effect_power, 0.0
         )
-        chi2_reduction = (effect_factors**2 * effect_power).reshape(_POSITION_COUNT, -1)
+        chi2_reduction = (effect_factors**2 * effect_power).reshape(_TRIAL_POSITION_COUNT, -1)
         likeliest_positions = np.argsort(-chi2_reduction.max(axis=1))[:pair_count]
         chosen_rows = likeliest_positions * delay_steps.size + chi2_reduction[
             likeliest_positions
         ].argmax(axis=1)
-        chosen_pairs: RealArray = with_second[chosen_rows]
+        chosen_pairs: RealArray = pairs_with_second[chosen_rows]
         chosen_pairs[:, 5] += np.log(np.clip(effect_factors[chosen_rows], 0.1, 100.0))
         first_obstacle_residuals = (
             residual_without_second
@@ -197,27 +208,40 @@ class TwoObstacleContact:
         return chosen_pairs
 
     @staticmethod
-    def in_reverse_order(parameters: RealArray) -> RealArray:
+    def reverse_obstacle_order(parameters: RealArray) -> RealArray:
         """Return pairs with exchanged obstacles, touched at the same instant, shape (k, 6)."""
         reversed_pairs: RealArray = parameters[:, [3, 1, 5, 0, 4, 2]]
         reversed_pairs[:, 4] = 0.0
         return reversed_pairs
 
     @staticmethod
-    def parameter_ranges(single_obstacle: ParameterRanges) -> ParameterRanges:
+    def parameter_ranges(single_obstacle_ranges: ParameterRanges) -> ParameterRanges:
         """Return bounds and step sizes for two obstacles, from those of one obstacle at rest."""
         return ParameterRanges(
             low=np.concatenate(
-                [single_obstacle.low, [single_obstacle.low[0], 0.0, single_obstacle.low[2]]]
+                [
+                    single_obstacle_ranges.lower_limits,
+                    [
+                        single_obstacle_ranges.lower_limits[0],
+                        0.0,
+                        single_obstacle_ranges.lower_limits[2],
+                    ],
+                ]
             ),
             high=np.concatenate(
                 [
-                    single_obstacle.high,
-                    [single_obstacle.high[0], _MAX_DISTANCE_M, single_obstacle.high[2]],
+                    single_obstacle_ranges.upper_limits,
+                    [
+                        single_obstacle_ranges.upper_limits[0],
+                        _MAX_APPROACH_DISTANCE_M,
+                        single_obstacle_ranges.upper_limits[2],
+                    ],
                 ]
             ),
-            derivative_step=np.concatenate([single_obstacle.derivative_step, [2e-4, 2e-5, 2e-2]]),
+            derivative_step=np.concatenate(
+                [single_obstacle_ranges.derivative_step, [2e-4, 2e-5, 2e-2]]
+            ),
             significant_change=np.array([6e-3, 1e-3, 1.0, 6e-3, 1e-3, 1.0]),
-            smallest_std=np.concatenate([single_obstacle.smallest_std, [1e-3, 2e-5, 2e-2]]),
+            smallest_std=np.concatenate([single_obstacle_ranges.smallest_std, [1e-3, 2e-5, 2e-2]]),
             largest_std=np.array([0.05, 5e-3, 1.0, 0.2, 0.05, 2.0]),
         )

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 RealArray = NDArray[np.float64]
 
-_STUDENT_DEGREES = 4.0
+_STUDENT_DEGREES_OF_FREEDOM = 4.0
 """Degrees of freedom of the Student distributions from which samples are drawn; few degrees give
 heavy tails."""
-_MAX_CENTRES = 16
+_MAX_PROPOSAL_CENTRES = 16
 """Largest number of samples around which Student distributions are centred in the next round."""
 
 
@@ -37,7 +37,7 @@ class Posterior:
     """Sum of squared residuals of each sample, shape (n,)."""
 
     @property
-    def effective_samples(self) -> float:
+    def effective_sample_count(self) -> float:
         """Effective sample size: the number of equally weighted samples of the same precision."""
         return float(1 / np.sum(self.weights**2))
 
@@ -79,18 +79,19 @@ def sample_posterior(
     rng = np.random.default_rng(0)  # the same record gives the same answer
     parameter_count = centres.shape[1]
     lower_bounds, upper_bounds = bounds
-    mixture = np.full(len(centres), 1 / len(centres))
+    mixture_weights = np.full(len(centres), 1 / len(centres))
     samples = np.empty((0, parameter_count))
     chi2 = np.empty(0)
     proposal_density = np.empty(0)
     proposals: list[tuple[RealArray, RealArray, RealArray]] = []
     posterior = None
     for _ in range(max_rounds):
-        chosen_centres = rng.choice(len(centres), samples_per_round, p=mixture)
+        chosen_centres = rng.choice(len(centres), samples_per_round, p=mixture_weights)
         centre_factors = np.linalg.cholesky(covariances)
         normal_numbers = rng.standard_normal((samples_per_round, parameter_count))
         student_scale = np.sqrt(
-            _STUDENT_DEGREES / rng.chisquare(_STUDENT_DEGREES, samples_per_round)
+            _STUDENT_DEGREES_OF_FREEDOM
+            / rng.chisquare(_STUDENT_DEGREES_OF_FREEDOM, samples_per_round)
         )
         drawn_samples = centres[chosen_centres] + student_scale[:, None] * np.einsum(
             "kpq,kq->kp", centre_factors[chosen_centres], normal_numbers
@@ -101,29 +102,29 @@ def sample_posterior(
         drawn_chi2 = np.full(samples_per_round, np.inf)
         if is_in_bounds.any():
             drawn_chi2[is_in_bounds] = chi2_of(drawn_samples[is_in_bounds])
-        proposals.append((centres, covariances, mixture))
+        proposals.append((centres, covariances, mixture_weights))
         proposal_density = (
             proposal_density + _density(samples, *proposals[-1])
             if samples.size
             else proposal_density
         )
-        own_density = sum(_density(drawn_samples, *proposal) for proposal in proposals)
+        new_proposal_density = sum(_density(drawn_samples, *proposal) for proposal in proposals)
         samples = np.concatenate([samples, drawn_samples])
         chi2 = np.concatenate([chi2, drawn_chi2])
-        proposal_density = np.concatenate([proposal_density, own_density])
+        proposal_density = np.concatenate([proposal_density, new_proposal_density])
         log_weights = -0.5 * (chi2 - chi2.min()) / residual_variance - np.log(proposal_density)
         weights = np.exp(log_weights - log_weights.max())
         weights /= weights.sum()
         posterior = Posterior(samples, weights, chi2)
-        if posterior.effective_samples > sufficient_samples and len(proposals) > 1:
+        if posterior.effective_sample_count > sufficient_samples and len(proposals) > 1:
             break
         # Tempered weights choose the next centres, so that one lucky sample does not dominate.
         tempered_weights = weights**0.5
         tempered_weights /= tempered_weights.sum()
-        best_centre = np.argsort(-tempered_weights)[:_MAX_CENTRES]
-        centres, mixture = (
-            samples[best_centre],
-            tempered_weights[best_centre] / tempered_weights[best_centre].sum(),
+        best_centre_indices = np.argsort(-tempered_weights)[:_MAX_PROPOSAL_CENTRES]
+        centres, mixture_weights = (
+            samples[best_centre_indices],
+            tempered_weights[best_centre_indices] / tempered_weights[best_centre_indices].sum(),
         )
         weighted_mean = tempered_weights @ samples
         deviations = samples - weighted_mean
@@ -132,10 +133,10 @@ def sample_posterior(
             6 * np.sqrt(weights @ (samples - weights @ samples) ** 2) + smallest_std,
         ) * np.sign(deviations)
         covariance = (clipped_deviation * tempered_weights[:, None]).T @ clipped_deviation
-        shrink_factor = max(len(best_centre), 2) ** (-2 / (parameter_count + 4))
+        shrink_factor = max(len(best_centre_indices), 2) ** (-2 / (parameter_count + 4))
         covariances = np.broadcast_to(
             shrink_factor * covariance + np.diag(smallest_std**2),
-            (len(best_centre), parameter_count, parameter_count),
+            (len(best_centre_indices), parameter_count, parameter_count),
         )
     assert posterior is not None
     return posterior
@@ -157,7 +158,7 @@ def _density(
         scaled_deviations = np.linalg.solve(cholesky_factor, (samples - proposal_centre).T)
         squared_distances = np.sum(scaled_deviations**2, axis=0)
         peak_density = centre_weight / np.prod(np.diag(cholesky_factor))
-        total_density += peak_density * (1 + squared_distances / _STUDENT_DEGREES) ** (
-            -(_STUDENT_DEGREES + parameter_count) / 2
+        total_density += peak_density * (1 + squared_distances / _STUDENT_DEGREES_OF_FREEDOM) ** (
+            -(_STUDENT_DEGREES_OF_FREEDOM + parameter_count) / 2
         )
     return total_density

@@ -36,7 +36,7 @@ class SensorFilter:
 
     @classmethod
     def for_records(
-        cls, corner_hz: float, order: int, kind: str, record_count: int, spacing_s: float
+        cls, corner_hz: float, order: int, filter_kind: str, record_count: int, spacing_s: float
     ) -> "SensorFilter":
         """Return the filter of a sensor that sends several records per tick, which are averaged.
 
@@ -44,7 +44,7 @@ class SensorFilter:
         ----------
         corner_hz, order
             Corner frequency and order of the sensor's low-pass filter.
-        kind
+        filter_kind
             How the records form a sample: "mean" of the records of one tick, or "triangle", their
             mean over two ticks with triangular weights.
         record_count
@@ -53,7 +53,7 @@ class SensorFilter:
             Time between two records.
         """
         record_weights = np.full(record_count, 1 / record_count)
-        if kind == "triangle":
+        if filter_kind == "triangle":
             record_weights = np.convolve(record_weights, record_weights)
         return cls(corner_hz, order, tuple(record_weights.tolist()), spacing_s)
 

@@ -9,14 +9,14 @@ from rigd.touch._free_motion import FreeBeam
 from rigd.touch._kernels import beam_positions, contact_kernels, cross_kernels
 from rigd.touch._model import TouchModel
 from rigd.touch._obstacle_contact import CandidateGrid
-from rigd.touch.samples import FINAL_S, FIRST_S, HISTORY_S
+from rigd.touch.samples import FINAL_ESTIMATE_S, FIRST_ESTIMATE_S, RECORD_BEFORE_DETECTION_S
 
 DETECTION_DELAYS_S: Final = (0.013, 0.04, 0.12)
 """Assumed upper limits in s of the time from a touch to its detection; the next one is tried if the
 estimate with a shorter one fails."""
 GRID_COMPARISON_S: Final = 0.022
 """Time in s after the detection up to which samples are compared with the grid of candidates."""
-_SPACING_M = 0.007
+_POSITION_SPACING_M = 0.007
 """Largest distance in m between neighbouring positions of the contact kernels."""
 
 
@@ -25,9 +25,11 @@ class TouchTables:
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self.rate_hz = model, rate_hz
-        self.x_m = beam_positions(model.plant.beam.length_m, _SPACING_M)
+        self.x_m = beam_positions(model.plant.beam.length_m, _POSITION_SPACING_M)
         steps_per_sample = 4 * max(1, round(4000 / rate_hz))
-        step_count = round((FINAL_S + DETECTION_DELAYS_S[-1] + 0.01) * rate_hz * steps_per_sample)
+        step_count = round(
+            (FINAL_ESTIMATE_S + DETECTION_DELAYS_S[-1] + 0.01) * rate_hz * steps_per_sample
+        )
         self.fine_kernels = contact_kernels(
             model.plant.beam,
             model.plant.damping,
@@ -48,22 +50,22 @@ class TouchTables:
             model.plant.damping,
             self.x_m,
             self.coarse_kernels.step_s,
-            self.coarse_kernels.steps,
+            self.coarse_kernels.step_count,
         )
         self.any_force_estimator = AnyForceEstimator(
-            half_sample_kernels, 2, round((FIRST_S + DETECTION_DELAYS_S[-1]) * rate_hz) + 1
+            half_sample_kernels, 2, round((FIRST_ESTIMATE_S + DETECTION_DELAYS_S[-1]) * rate_hz) + 1
         )
-        self.max_samples = round((HISTORY_S + FINAL_S) * rate_hz) + 1
+        self.max_samples = round((RECORD_BEFORE_DETECTION_S + FINAL_ESTIMATE_S) * rate_hz) + 1
         self.free_beam = FreeBeam(model, self.x_m, rate_hz, self.max_samples)
         self._grids: dict[int, CandidateGrid] = {}
         self.candidate_grid(
             round(DETECTION_DELAYS_S[0] * rate_hz) + round(GRID_COMPARISON_S * rate_hz)
         )
-        no_positions = np.empty(0)
+        empty_positions = np.empty(0)
         self.changed_beams = [
             FreeBeam(
                 model.with_changed_parameter(parameter_name, std),
-                no_positions,
+                empty_positions,
                 rate_hz,
                 self.max_samples,
             )

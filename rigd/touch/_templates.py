@@ -27,16 +27,16 @@ RealArray = NDArray[np.float64]
 
 _POSITION_FRACTIONS = np.linspace(0.04, 1.0, 33)
 """Positions of the templates' obstacles, as fractions of the beam's length."""
-_STIFFNESSES_N_PER_M = np.array([1e2, 2e2, 4e2, 1e3, 3e3, 1e4, 3e4, 1e5])
+_CONTACT_STIFFNESSES_N_PER_M = np.array([1e2, 2e2, 4e2, 1e3, 3e3, 1e4, 3e4, 1e5])
 """Stiffnesses of the templates' obstacles."""
 _CONTACT_AGES_S = np.array([2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 17, 20, 24]) * 1e-3
 """Times in s from the beginning of a contact to the tick in which its template is compared."""
-_CONTACT_PHASES = 2
+_CONTACT_PHASE_COUNT = 2
 """Number of instants within a tick at which contacts begin; one is too few, because bending waves
 change their sign from tick to tick."""
 _STEPS_PER_TICK = 16
 """Number of time steps of the integration in a tick."""
-_REDUNDANT_CORRELATION = 0.9
+_MAX_TEMPLATE_CORRELATION = 0.9
 """Correlation of two templates above which one of them is redundant: of 6864 templates 500
 remain."""
 
@@ -45,7 +45,7 @@ remain."""
 class DetectorModel:
     """Beam model and templates of contacts for a `TouchDetector`."""
 
-    observed: ObservedBeam
+    observed_beam: ObservedBeam
     """Model of the free beam that computes the innovations."""
     templates: RealArray
     """Templates from the function `contact_templates`, shape (templates, 2 · ticks)."""
@@ -105,54 +105,59 @@ def contact_templates(
     ndarray of shape (templates, 2 · ticks)
         Innovations of torque and shear in turn for the last ticks, the oldest tick first.
     """
-    ages_ticks = np.maximum(1, np.round(_CONTACT_AGES_S * rate_hz)).astype(int)
-    tick_count = int(ages_ticks.max())
+    contact_ages_ticks = np.maximum(1, np.round(_CONTACT_AGES_S * rate_hz)).astype(int)
+    tick_count = int(contact_ages_ticks.max())
     step_s = 1 / (_STEPS_PER_TICK * rate_hz)
     positions_m = beam.length_m * _POSITION_FRACTIONS
     kernels = contact_kernels(
         beam, damping, positions_m, step_s, _STEPS_PER_TICK * tick_count + 1, sensor_filter
     )
-    approaches_m = positions_m[:, None] * step_s * np.arange(kernels.steps)
+    approaches_m = positions_m[:, None] * step_s * np.arange(kernels.step_count)
     impulse_responses = _impulse_responses(model, tick_count)
 
     template_blocks = []
-    for stiffness_n_per_m in _STIFFNESSES_N_PER_M:
+    for stiffness_n_per_m in _CONTACT_STIFFNESSES_N_PER_M:
         forces_n = integrate_contact(
-            kernels.displacement, approaches_m, np.full(positions_m.size, stiffness_n_per_m), step_s
+            kernels.displacement_m_per_n,
+            approaches_m,
+            np.full(positions_m.size, stiffness_n_per_m),
+            step_s,
         )
         tick_readings = contact_responses(
-            (kernels.torque, kernels.shear),
+            (kernels.torque_nm_per_n, kernels.shear_per_n),
             forces_n,
-            _STEPS_PER_TICK // _CONTACT_PHASES,
-            _CONTACT_PHASES * tick_count + 1,
+            _STEPS_PER_TICK // _CONTACT_PHASE_COUNT,
+            _CONTACT_PHASE_COUNT * tick_count + 1,
         )
-        for tick_phase in range(1, _CONTACT_PHASES + 1):
+        for tick_phase in range(1, _CONTACT_PHASE_COUNT + 1):
             tick_forces = (
-                tick_readings[:, :, tick_phase::_CONTACT_PHASES]
+                tick_readings[:, :, tick_phase::_CONTACT_PHASE_COUNT]
                 .transpose(0, 2, 1)
                 .reshape(-1, 2 * tick_count)
             )
             innovations = tick_forces @ impulse_responses
-            for age in ages_ticks:
+            for age in contact_ages_ticks:
                 aged_templates = np.zeros_like(innovations)
                 aged_templates[:, 2 * (tick_count - age) :] = innovations[:, : 2 * age]
                 template_blocks.append(aged_templates)
     all_templates = np.concatenate(template_blocks)
-    norms = np.linalg.norm(all_templates, axis=1)
-    return _select_dissimilar(all_templates[norms > 0] / norms[norms > 0, None])
+    template_norms = np.linalg.norm(all_templates, axis=1)
+    return _select_dissimilar(
+        all_templates[template_norms > 0] / template_norms[template_norms > 0, None]
+    )
 
 
-def _impulse_responses(model: ObservedBeam, ticks: int) -> RealArray:
+def _impulse_responses(model: ObservedBeam, tick_count: int) -> RealArray:
     """Return the matrix M with ``innovations = readings @ M``, shape (2 · ticks, 2 · ticks).
 
     Both row vectors have torque and shear in turn for each tick.
     """
-    response_matrix = np.zeros((2 * ticks, 2 * ticks))
+    response_matrix = np.zeros((2 * tick_count, 2 * tick_count))
     for channel_index, unit_impulse in enumerate(((1.0, 0.0), (0.0, 1.0))):
         innovation_filter = InnovationFilter(model)
-        for tick in range(ticks):
+        for tick in range(tick_count):
             innovation_filter.step(0.0, *(unit_impulse if tick == 0 else (0.0, 0.0)))
-            for row_begin in range(ticks - tick):
+            for row_begin in range(tick_count - tick):
                 first_column = 2 * (row_begin + tick)
                 response_matrix[2 * row_begin + channel_index, first_column : first_column + 2] = (
                     innovation_filter.whitened
@@ -167,10 +172,10 @@ def _select_dissimilar(unit_vectors: RealArray) -> RealArray:
     """
     selected_rows = [0]
     similarities = np.abs(unit_vectors @ unit_vectors[0])
-    while similarities.min() < _REDUNDANT_CORRELATION:
-        farthest_row = int(similarities.argmin())
-        selected_rows.append(farthest_row)
+    while similarities.min() < _MAX_TEMPLATE_CORRELATION:
+        least_similar_row = int(similarities.argmin())
+        selected_rows.append(least_similar_row)
         np.maximum(
-            similarities, np.abs(unit_vectors @ unit_vectors[farthest_row]), out=similarities
+            similarities, np.abs(unit_vectors @ unit_vectors[least_similar_row]), out=similarities
         )
     return unit_vectors[selected_rows]

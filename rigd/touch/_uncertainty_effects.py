@@ -41,9 +41,9 @@ def uncertainty_effects(
     window_slice = slice(sample_window.first_sample, sample_window.end_sample)
     residuals = free_motion.innovations[:, window_slice] - middle_effect
     x = float(likely_obstacle[0, 0])
-    nearby_m = min(x, touch_tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
+    nearby_positions_m = min(x, touch_tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
     for nearby_beam in touch_tables.changed_beams:
-        changed_beam = nearby_beam.at_positions(nearby_m).motion(
+        changed_beam = nearby_beam.at_positions(nearby_positions_m).motion(
             touch_record, quiet_samples, quiet_samples - 4, free_motion.angle_transform
         )
         nearby_kernels = contact_kernels(
@@ -55,9 +55,9 @@ def uncertainty_effects(
             + 4,
             nearby_beam.model.sensor_filter,
         )
-        position_effect, _ = ObstacleContact(nearby_kernels, nearby_m, changed_beam).predict(
-            likely_obstacle, sample_window, kernels=nearby_kernels
-        )
+        position_effect, _ = ObstacleContact(
+            nearby_kernels, nearby_positions_m, changed_beam
+        ).predict(likely_obstacle, sample_window, kernels=nearby_kernels)
         effect_list.append(
             changed_beam.innovations[:, window_slice] - position_effect[0] - residuals
         )
@@ -109,9 +109,9 @@ def _encoder_noise_effects(
     """
     free_motion = sample_window.motion
     sample_indices = np.arange(sample_window.first_sample, sample_window.end_sample)
-    nearest_position = int(np.argmin(np.abs(touch_tables.x_m - likely_obstacle[0])))
+    nearest_position_index = int(np.argmin(np.abs(touch_tables.x_m - likely_obstacle[0])))
     sample_displacement = touch_tables.free_beam.displacement_per_sample(
-        nearest_position, sample_indices.size + 8
+        nearest_position_index, sample_indices.size + 8
     )
     # Columns begin four samples before the window.
     window_steps = np.arange(free_motion.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE

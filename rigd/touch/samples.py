@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 from rigd.session.layout import WRENCH_FIELDS
 from rigd.touch._free_motion import TouchRecord
 
-HISTORY_S: Final = 1.5
+RECORD_BEFORE_DETECTION_S: Final = 1.5
 """Time in s before a detection from which on samples are used for an estimate."""
-CONTACT_S: Final = 0.8
+MAX_CONTACT_S: Final = 0.8
 """Longest assumed duration in s of the contact after a detection."""
-PREVIEW_S: Final = 0.025
+PREVIEW_SEARCH_S: Final = 0.025
 """Time in s after a detection up to which the preliminary search of the position uses samples."""
-FIRST_S: Final = 0.05
+FIRST_ESTIMATE_S: Final = 0.05
 """Time in s after a detection up to which the first estimate uses samples."""
-FINAL_S: Final = 0.2
+FINAL_ESTIMATE_S: Final = 0.2
 """Time in s after a detection up to which the last estimate uses samples."""
 
 
 def around_touch(
-    samples: NDArray[np.void], tick: int, rate_hz: float, free_from: int = 0
+    samples: NDArray[np.void], tick: int, rate_hz: float, first_free_tick: int = 0
 ) -> NDArray[np.void]:
     """Return the samples from 1.5 s before the detection of a touch to 0.2 s after it.
 
@@ -34,12 +34,12 @@ def around_touch(
         Tick of the detection.
     rate_hz
         Ticks a second.
-    free_from
+    first_free_tick
         Earliest tick whose sample may be used, because the beam was in contact before it.
     """
     sample_ticks = samples["tick"].astype(np.int64)
-    first_tick = max(tick - round(HISTORY_S * rate_hz), free_from)
-    last_tick = tick + round(FINAL_S * rate_hz)
+    first_tick = max(tick - round(RECORD_BEFORE_DETECTION_S * rate_hz), first_free_tick)
+    last_tick = tick + round(FINAL_ESTIMATE_S * rate_hz)
     return samples[(sample_ticks >= first_tick) & (sample_ticks <= last_tick)]
 
 
@@ -65,14 +65,16 @@ def touch_record(
     sample_ticks = samples["tick"].astype(np.int64)
     all_ticks = np.arange(sample_ticks[0], sample_ticks[-1] + 1)
 
-    def interpolated(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.interp(all_ticks, sample_ticks, values)
+    def interpolate_samples(sample_values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.interp(all_ticks, sample_ticks, sample_values)
 
     return TouchRecord(
         rate_hz,
-        interpolated(samples["angle_rad"]),
-        interpolated(samples["coupling_torque_nm"]),
-        None if shear_projection is None else interpolated(base_shear_n(samples, shear_projection)),
+        interpolate_samples(samples["angle_rad"]),
+        interpolate_samples(samples["coupling_torque_nm"]),
+        None
+        if shear_projection is None
+        else interpolate_samples(base_shear_n(samples, shear_projection)),
         int(tick - sample_ticks[0]),
     )
 

@@ -310,7 +310,7 @@ class Scene:
             and (response_estimate := self._response.estimate()) is not None
         ):
             self.response_charts.update(self._t_ns, response_estimate)
-            self._response_is_final = response_estimate.final
+            self._response_is_final = response_estimate.is_final
         # Drawn again even if final: the last drawing may have been dropped.
         drawings.append(self.response_charts.draw)
         if self._columns:

@@ -182,12 +182,12 @@ class ResponseCharts:
             "output_delay_s": session.torque_delay_s,
         }
         decimation = response_decimation(frequency_hz)
-        magnitude_strips = decimation.strips(model_magnitude_db)
+        magnitude_strips = decimation.curve_strips(model_magnitude_db)
         self._models = (
             {
                 OVERVIEW_MAGNITUDE_ENTITY: magnitude_strips,
                 MAGNITUDE_ENTITY: magnitude_strips,
-                PHASE_ENTITY: decimation.strips(phase_deg(model_response)),
+                PHASE_ENTITY: decimation.curve_strips(phase_deg(model_response)),
             }
             if is_damping_known
             else {}
@@ -251,7 +251,7 @@ class ResponseCharts:
         frequency_hz = corrected_response.frequency_hz
         if self._thinning is None or self._thinning.grid.size != frequency_hz.size:
             self._thinning = response_decimation(frequency_hz)
-        is_excited = estimate.excited
+        is_excited = estimate.is_excited
         self._t_ns = t_ns
         self._last_update = frequency_hz, np.where(is_excited, corrected_response.response, np.nan)
         is_coherent = is_excited
@@ -279,7 +279,7 @@ class ResponseCharts:
             else (HIGHEST_SHOWN_HZ, HIGHEST_SHOWN_HZ)
         )
         self._excited_hz = float(excited_ends_hz[0]), float(excited_ends_hz[1])
-        no_coherence_text = NO_COHERENCE_TEXT if estimate.final else NO_COHERENCE_YET_TEXT
+        no_coherence_text = NO_COHERENCE_TEXT if estimate.is_final else NO_COHERENCE_YET_TEXT
         self._note = no_coherence_text if corrected_response.coherence is None else ""
 
     def draw(self, stream: "RecordingStream") -> None:
@@ -323,7 +323,7 @@ def _last_response_curves(
     """Return the curves of an earlier session's response: entity path of the chart → strips."""
     decimation = response_decimation(last_response.frequency_hz)
     return {
-        response_curve.chart.entity: decimation.strips(
+        response_curve.chart.entity: decimation.curve_strips(
             response_curve.values_of_complex(last_response.response)
         )
         for response_curve in response_curves

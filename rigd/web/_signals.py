@@ -220,21 +220,24 @@ class SessionResponse:
         self._feed_sweep()
         sweep_estimate = self._sweep.estimate() if self._has_new_data else None
         self._has_new_data = False
-        if sweep_estimate is None or not sweep_estimate.excited.any():
+        if sweep_estimate is None or not sweep_estimate.is_excited.any():
             return None
-        highest_reached_hz = float(sweep_estimate.response.frequency_hz[sweep_estimate.excited][-1])
-        if sweep_estimate.final and highest_reached_hz < self._reached_hz:
+        highest_reached_hz = float(
+            sweep_estimate.response.frequency_hz[sweep_estimate.is_excited][-1]
+        )
+        if sweep_estimate.is_final and highest_reached_hz < self._reached_hz:
             return None  # the last complete segment ends before the sweep
         self._reached_hz = highest_reached_hz
         response = sweep_estimate.response.without_delays(**self._delays_s)
         grid_frequencies_hz = response.frequency_hz
         if self._thinning is None:
             self._thinning = response_decimation(grid_frequencies_hz)
-        shown_response = np.where(sweep_estimate.excited, response.response, np.nan)
+        shown_response = np.where(sweep_estimate.is_excited, response.response, np.nan)
         # The unknown values at both ends of a gap interrupt the line.
         shown_magnitudes = np.abs(shown_response)
         shown_indices = np.union1d(
-            self._thinning.extremes(shown_magnitudes), self._thinning.gaps(shown_magnitudes)
+            self._thinning.extreme_indices(shown_magnitudes),
+            self._thinning.gap_edge_indices(shown_magnitudes),
         )
         coherence = None
         if response.coherence is not None:
@@ -254,7 +257,7 @@ def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) ->
     `tool_inertia_kg_m2` is the inertia between sensor and beam.
     """
     grid_frequencies_hz, model_response = nominal_response(beam, damping, tool_inertia_kg_m2)
-    shown_indices = response_decimation(grid_frequencies_hz).extremes(np.abs(model_response))
+    shown_indices = response_decimation(grid_frequencies_hz).extreme_indices(np.abs(model_response))
     return {
         "type": "nominal",
         **_response_document(grid_frequencies_hz[shown_indices], model_response[shown_indices]),

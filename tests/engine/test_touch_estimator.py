@@ -20,12 +20,12 @@ class RecordingFollower:
         self.requests = requests
 
     def preview(self, record):
-        self.requests.append(("look", record.angle_rad.size - record.detected))
+        self.requests.append(("look", record.angle_rad.size - record.detection_index))
 
-    def update(self, record, *, scan, first):
+    def update(self, record, *, scan, is_first):
         assert not scan
-        after = record.angle_rad.size - record.detected
-        self.requests.append(("first" if first else "last", after))
+        after = record.angle_rad.size - record.detection_index
+        self.requests.append(("first" if is_first else "last", after))
         return SimpleNamespace(as_dict=lambda start_s: {"start_s": start_s})
 
 

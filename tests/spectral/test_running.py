@@ -101,14 +101,14 @@ def test_final_estimate_equals_welchs(noisy):
     running = RunningResponse(RATE_HZ, samples, last_hz=LAST_HZ)
     for first in range(0, samples, 50):
         if first in (30_000, 119_950):
-            assert not running.estimate().final
+            assert not running.estimate().is_final
         running.feed(np.arange(first, first + 50), *noisy.part(first, first + 50))
     found = running.estimate()
-    assert found.final
+    assert found.is_final
     assert found.response.frequency_hz[-1] == LAST_HZ
     assert_equals_welch(found, welch_response(noisy.angle, noisy.torque, RATE_HZ))
     assert found.response.segments == 8
-    excited_hz = found.response.frequency_hz[found.excited]
+    excited_hz = found.response.frequency_hz[found.is_excited]
     assert excited_hz.min() < 0.1
     assert 49.8 < excited_hz.max() < 50.05
 
@@ -119,7 +119,7 @@ def test_short_records_use_the_segments_of_analyze(duration_s):
     samples = sweep.reference.size
     chosen = segmentation_of(samples, RATE_HZ)
     *earlier, (_, found) = estimates(sweep, samples // 20)
-    assert found.final
+    assert found.is_final
     whole = welch_response(
         sweep.angle,
         sweep.torque,
@@ -138,8 +138,8 @@ def test_estimate_is_near_the_truth_throughout_the_sweep(paper):
     last_hz = []
     for end, found in estimates(paper, 6000):
         frequency_hz = found.response.frequency_hz
-        seen = found.excited & (frequency_hz > 4.0)
-        last_hz.append(frequency_hz[found.excited].max())
+        seen = found.is_excited & (frequency_hz > 4.0)
+        last_hz.append(frequency_hz[found.is_excited].max())
         if end < 18_000:
             continue
         true = TransferGrid(2j * np.pi * frequency_hz[seen]).evaluate(BEAM, DAMPING)
@@ -178,12 +178,12 @@ def test_chirp_excites_up_to_its_frequency(start_hz, stop_hz, duration_s, taper_
     hz_per_s = (stop_hz - start_hz) / duration_s
     inspected = 0
     for end, found in estimates(Sweep(reference, reference, reference), reference.size // 40):
-        if found is None or found.final:
+        if found is None or found.is_final:
             continue
         inspected += 1
         now_hz = start_hz + hz_per_s * end / RATE_HZ
         frequency_hz = found.response.frequency_hz
-        first_hz, last_hz = frequency_hz[found.excited][[0, -1]]
+        first_hz, last_hz = frequency_hz[found.is_excited][[0, -1]]
         front_hz, back_hz = (last_hz, first_hz) if hz_per_s > 0 else (first_hz, last_hz)
         lead_hz = (front_hz - now_hz) * np.sign(hz_per_s)
         resolution_hz = RATE_HZ / min(end, length)
@@ -196,7 +196,7 @@ def test_chirp_excites_up_to_its_frequency(start_hz, stop_hz, duration_s, taper_
         assert abs(back_hz - start_hz) < resolution_hz + (0.5 + taper_s) * abs(hz_per_s), end
         # One band, except perhaps for frequencies passed quickly at its lower end.
         within = (frequency_hz > max(first_hz, 0.5)) & (frequency_hz < last_hz)
-        assert found.excited[within].all(), end
+        assert found.is_excited[within].all(), end
     assert inspected >= 20
 
 
@@ -204,7 +204,7 @@ def test_a_multisine_has_excited_its_band_from_the_beginning():
     excitation = multisine(rate_hz=RATE_HZ, start_hz=2.0, stop_hz=30.0, duration_s=40.0)
     reference = excitation.reference_rad[slice(*excitation.segments["sweep"])]
     for _, found in estimates(Sweep(reference, reference, reference), 5000):
-        excited_hz = found.response.frequency_hz[found.excited]
+        excited_hz = found.response.frequency_hz[found.is_excited]
         assert excited_hz.min() == pytest.approx(2.0, abs=0.1)
         assert excited_hz.max() == pytest.approx(30.0, abs=0.1)
         assert excited_hz.size == np.ptp(excited_hz).round(6) * 160 + 1
@@ -219,7 +219,7 @@ def test_step_and_hold_have_no_excited_band():
         assert seen
         for found in seen:
             above = found.response.frequency_hz > 0.25
-            assert not found.excited[above].any()
+            assert not found.is_excited[above].any()
 
 
 @pytest.mark.parametrize("offset_rad", [0.05, -0.3])
@@ -228,7 +228,7 @@ def test_excited_band_does_not_depend_on_the_mean_angle(paper, offset_rad):
     for (_, here), (_, shifted) in zip(
         estimates(paper, 20_000), estimates(there, 20_000), strict=True
     ):
-        np.testing.assert_array_equal(here.excited, shifted.excited)
+        np.testing.assert_array_equal(here.is_excited, shifted.is_excited)
         np.testing.assert_array_equal(here.response.response, shifted.response.response)
 
 
@@ -238,7 +238,7 @@ def test_coherence_from_two_whole_segments_on(noisy):
         assert (found.response.coherence is not None) == (whole >= 2)
         if whole >= 2:
             beyond = found.response.frequency_hz > 55.0
-            passed = found.excited & (found.response.frequency_hz > 5.0)
+            passed = found.is_excited & (found.response.frequency_hz > 5.0)
             assert np.median(found.response.coherence[passed]) > 0.99
             assert np.median(found.response.coherence[beyond]) < 0.9
 
@@ -278,7 +278,7 @@ def test_estimate_does_not_depend_on_blocks(data):
     assert (one is None) == (other is None)
     if one is not None:
         np.testing.assert_array_equal(one.response.response, other.response.response)
-        np.testing.assert_array_equal(one.excited, other.excited)
+        np.testing.assert_array_equal(one.is_excited, other.is_excited)
         assert (one.final, one.response.segments) == (other.final, other.response.segments)
         assert (one.response.coherence is None) == (other.response.coherence is None)
 
@@ -298,7 +298,7 @@ def test_short_gaps_are_interpolated_as_analyze_does(first):
     running.feed(ticks[~missing], *record[:, ~missing])
     filled = [np.interp(ticks, ticks[~missing], channel[~missing]) for channel in record]
     found = running.estimate()
-    assert found.final
+    assert found.is_final
     assert_equals_welch(found, small_welch(np.stack(filled)[:, -first : 3000 - first]))
 
 
@@ -344,10 +344,10 @@ def test_trailing_gap_is_closed_by_later_samples():
     known = (ticks < 2900) | (ticks >= 3100)
     running = small()
     running.feed(ticks[:2900], *record[:, :2900])
-    assert not running.estimate().final
+    assert not running.estimate().is_final
     running.feed(ticks[known][2900:], *record[:, known][:, 2900:])
     found = running.estimate()
-    assert found.final
+    assert found.is_final
     assert_equals_welch(found, small_welch(record[:, :2900]))
 
 
@@ -360,8 +360,8 @@ def test_no_estimate_from_too_few_samples():
     assert running.estimate() is None
     running.feed([99], *record[:, 99:100])
     found = running.estimate()
-    assert (found.response.segments, found.response.coherence, found.final) == (1, None, False)
-    assert found.excited.all()
+    assert (found.response.segments, found.response.coherence, found.is_final) == (1, None, False)
+    assert found.is_excited.all()
 
 
 def test_memory_does_not_grow_with_the_record():

@@ -62,7 +62,7 @@ def test_unexplained_later_samples_are_ignored(
 ):
     """Bounces amplify small errors of the model, so that the first estimate is more accurate."""
     record = cut(records_by_name["middle"], 100)
-    is_later = np.arange(record.torque_nm.size) >= record.detected + 55
+    is_later = np.arange(record.torque_nm.size) >= record.detection_index + 55
     disturbance_nm = np.random.default_rng(1).normal(0.0, 8e-3, is_later.size) * is_later
     estimate = estimator.estimate(replace(record, torque_nm=record.torque_nm + disturbance_nm))
     assert estimate_of("middle").samples == 100
@@ -146,7 +146,7 @@ def test_first_interval_includes_pairs_of_obstacles(estimator):
     """With this noise two obstacles explain the first 50 ms only a little better than one."""
     (first, second), slew = ALIKE["two alike"]
     [record] = simulate([(first, second)], [slew], duration_s=0.62, steps=20, modes=20, seed=7)
-    estimate = estimator.follow().update(cut(record, 50), scan=False, first=True)
+    estimate = estimator.growing_estimator().update(cut(record, 50), scan=False, is_first=True)
     low, high = estimate.x_m.interval_95
     assert low < first.x_m < high < second.x_m
     assert abs(estimate.x_m.value - first.x_m) < 4 * estimate.x_m.std
@@ -166,9 +166,9 @@ def test_one_obstacle_is_not_reported_as_two(estimator, ambiguous_records, after
 
 def growing_estimates(estimator, simulated, *, noticed=NOTICED):
     """Return first and last estimate, updated as in the process of the touch estimator."""
-    growing_estimate = estimator.follow()
+    growing_estimate = estimator.growing_estimator()
     growing_estimate.preview(cut(simulated, 25, noticed=noticed))
-    first = growing_estimate.update(cut(simulated, 50, noticed=noticed), scan=False, first=True)
+    first = growing_estimate.update(cut(simulated, 50, noticed=noticed), scan=False, is_first=True)
     return first, growing_estimate.update(cut(simulated, 190, noticed=noticed), scan=False)
 
 
@@ -208,7 +208,7 @@ def test_first_estimate_of_other_kinds_is_unknown(estimates_of, name):
 
 
 def test_update_with_record_that_does_not_grow(estimator, records_by_name):
-    growing_estimate = estimator.follow()
+    growing_estimate = estimator.growing_estimator()
     estimates = [
         growing_estimate.update(cut(records_by_name["middle"], after), scan=False)
         for after in (50, 50, 200)

@@ -14,7 +14,7 @@ def motions(model, records_by_name):
     x_m = np.linspace(0.1, 1.0, 128) * model.plant.beam.length_m
     beam = FreeBeam(model, x_m, record.rate_hz, record.angle_rad.size)
     selected = [0, 70, -1]
-    quiet = record.detected - 13
+    quiet = record.detection_index - 13
     direct = beam.at_positions(x_m[selected])
     interpolated = beam.motion(record, quiet, quiet)
     return (
@@ -33,7 +33,7 @@ def test_interpolated_displacement_equals_direct_computation(motions):
 def test_same_innovations_with_precomputed_transform(motions, model):
     _, interpolated, direct, record = motions
     recomputed = FreeBeam(model, np.array([0.5]), record.rate_hz, record.angle_rad.size).motion(
-        record, record.detected - 13, record.detected - 13
+        record, record.detection_index - 13, record.detection_index - 13
     )
     for motion in (direct, recomputed):
         assert motion.innovations == pytest.approx(interpolated.innovations, abs=1e-12)

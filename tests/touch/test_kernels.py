@@ -53,7 +53,7 @@ def test_displacement_is_the_sum_of_the_modes(at_point):
             for weight, shift in ((1, STEP_S), (-2, 0), (1, -STEP_S))
         )
         total += shape[i] ** 2 / (LINK.density_kg_per_m * LINK.length_m) * hat / STEP_S
-    assert np.abs(total - at_point.displacement[0]).max() < 3e-4 * np.abs(total).max()
+    assert np.abs(total - at_point.displacement_m_per_n[0]).max() < 3e-4 * np.abs(total).max()
 
 
 def test_cross_kernels_match_exact_model():
@@ -123,7 +123,7 @@ def test_averaged_kernels_are_means_of_delayed_ones(at_point):
             np.mean(delayed, axis=0), abs=2e-3 * np.abs(unfiltered).max()
         )
     # The filter does not act on the displacement.
-    assert np.array_equal(filtered.displacement, at_point.displacement)
+    assert np.array_equal(filtered.displacement_m_per_n, at_point.displacement_m_per_n)
     assert mean.weights_delay_s == 3 * STEP_S
 
 
@@ -136,6 +136,6 @@ def test_low_pass_filter_matches_scipy(at_point, order):
     from scipy.signal import TransferFunction, lsim  # half a second for every worker
 
     system = TransferFunction([1.0], u if order == 1 else [u[0] ** 2, sqrt(2) * u[0], 1.0])
-    _, computed, _ = lsim(system, at_point.shear[0], np.arange(400) * STEP_S)
-    assert filtered.shear[0] == pytest.approx(computed, abs=1e-2 * np.abs(computed).max())
+    _, computed, _ = lsim(system, at_point.shear_per_n[0], np.arange(400) * STEP_S)
+    assert filtered.shear_per_n[0] == pytest.approx(computed, abs=1e-2 * np.abs(computed).max())
     assert abs(low_pass.response(1j * corner)) == pytest.approx(sqrt(0.5))

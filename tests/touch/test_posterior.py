@@ -30,7 +30,7 @@ def test_a_normal_distribution_has_its_moments_and_quantiles():
     assert posterior.std(0) == pytest.approx(0.5, rel=0.1)
     assert posterior.std(1) == pytest.approx(2.0, rel=0.1)
     assert posterior.quantiles(0, (0.025, 0.975)) == pytest.approx([0.02, 1.98], abs=0.15)
-    assert posterior.effective_samples > 300
+    assert posterior.effective_sample_count > 300
 
 
 def test_weights_of_two_minima():

@@ -31,7 +31,7 @@ def estimate(description, *, excited_up_to_hz=20.0, delays_s=(0.0, 0.0)) -> Runn
     below, above = np.searchsorted(GRID, [0.1, excited_up_to_hz], side="right")
     excited = np.zeros(GRID.shape, bool)
     excited[below:above] = True
-    return RunningEstimate(response, excited, final=False)
+    return RunningEstimate(response, excited, is_final=False)
 
 
 def strips(shown) -> list[np.ndarray]:
