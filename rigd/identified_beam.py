@@ -434,7 +434,7 @@ def findings_without_parameter(named_findings: object) -> list[tuple[int, str, s
 
 
 def _effect_key(parameter_name: str) -> str:
-    """Return the key of a parameter in `_EFFECTS`; that of an offset lacks the mode's number."""
+    """Return a parameter's key in `_EFFECT_TEXTS`; that of an offset lacks the mode's number."""
     return OFFSET_PREFIX if parameter_name.startswith(OFFSET_PREFIX) else parameter_name
 
 

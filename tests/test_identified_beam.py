@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, participation
-from rigd.identified_beam import MOVE, TOUCH, IdentifiedBeamError, read_identified_beam
+from rigd.identified_beam import MOVE_USE, TOUCH_USE, IdentifiedBeamError, read_identified_beam
 from rigd.profile import load_profile
 
 STATED = Plant(Beam(0.98, 4.7e-3, 0.09), Damping())
@@ -35,11 +35,11 @@ def refusal(path, use):
 
 
 def test_the_beam_of_an_analysis_is_read(analysed, profile):
-    found = read_identified_beam(analysed(), profile.plant, MOVE)
+    found = read_identified_beam(analysed(), profile.plant, MOVE_USE)
     assert found.plant.damping == profile.rig.damping
     assert found.plant.beam.density_kg_per_m == pytest.approx(profile.rig.beam.density_kg_per_m)
     assert found.pole_uncertainty(2) == pytest.approx((1e-4, 1e-4))
-    undamped = read_identified_beam(analysed(zeta=None, alpha=None), STATED, TOUCH)
+    undamped = read_identified_beam(analysed(zeta=None, alpha=None), STATED, TOUCH_USE)
     assert undamped.plant.damping.zeta == 0.0
 
 
@@ -58,7 +58,7 @@ def test_the_beam_of_an_analysis_is_read(analysed, profile):
 )
 def test_errors_of_the_document_are_reported(analysed, other, message):
     with pytest.raises(IdentifiedBeamError, match=message) as refused:
-        read_identified_beam(analysed(**other), STATED, MOVE)
+        read_identified_beam(analysed(**other), STATED, MOVE_USE)
     assert "model.json" in str(refused.value)
 
 
@@ -69,9 +69,9 @@ def test_other_file_is_refused(tmp_path, text):
     path = tmp_path / "model.json"
     path.write_text(text)
     with pytest.raises(IdentifiedBeamError, match="analyze session"):
-        read_identified_beam(path, STATED, MOVE)
+        read_identified_beam(path, STATED, MOVE_USE)
     with pytest.raises(IdentifiedBeamError, match="cannot be read"):
-        read_identified_beam(tmp_path / "none.json", STATED, MOVE)
+        read_identified_beam(tmp_path / "none.json", STATED, MOVE_USE)
 
 
 @pytest.mark.parametrize(
@@ -84,15 +84,15 @@ def test_other_file_is_refused(tmp_path, text):
 )
 def test_move_accepts_ends_and_modes_but_touch_does_not(analysed, effect, read):
     path = analysed(**effect)
-    loaded = read_identified_beam(path, STATED, MOVE).plant
+    loaded = read_identified_beam(path, STATED, MOVE_USE).plant
     found = loaded.tip_mass_kg, loaded.root_compliance_rad_per_nm, loaded.stiffness_offsets
     assert found == read
-    refused = refusal(path, TOUCH)
+    refused = refusal(path, TOUCH_USE)
     assert f"parameters.{next(iter(effect))}.value = " in refused
     assert "a search for touches does not take into account" in refused
 
 
-@pytest.mark.parametrize("use", [MOVE, TOUCH])
+@pytest.mark.parametrize("use", [MOVE_USE, TOUCH_USE])
 @pytest.mark.parametrize(
     ("effect", "message"),
     [
@@ -113,10 +113,10 @@ def test_unsupported_effect_is_refused_by_name(analysed, use, effect, message):
 
 def test_effect_of_size_zero_has_no_influence(analysed):
     none = {"drag": {"value": 0.0}, "filter_time_constant_s": {"value": 0.0}}
-    assert read_identified_beam(analysed(**none), STATED, TOUCH).plant.is_uniform_cantilever
+    assert read_identified_beam(analysed(**none), STATED, TOUCH_USE).plant.is_uniform_cantilever
 
 
-@pytest.mark.parametrize("use", [MOVE, TOUCH])
+@pytest.mark.parametrize("use", [MOVE_USE, TOUCH_USE])
 @pytest.mark.parametrize(
     ("what", "accepted"),
     [
@@ -142,7 +142,7 @@ def test_unreadable_uniformity_test_is_refused(analysed, stated):
     with pytest.raises(
         IdentifiedBeamError, match=r"model\.json: validity\.uniform_beam = .* is not"
     ):
-        read_identified_beam(path, STATED, MOVE)
+        read_identified_beam(path, STATED, MOVE_USE)
 
 
 def flagged(value, **more):
@@ -152,22 +152,22 @@ def flagged(value, **more):
 def test_a_flagged_number_is_refused(analysed):
     for name in ("density_over_stiffness", "bending_stiffness_n_m2"):
         path = analysed(**{name: flagged(0.05)})
-        for use in (MOVE, TOUCH):
+        for use in (MOVE_USE, TOUCH_USE):
             refused = refusal(path, use)
             assert f"{name} is flagged (another explanation fits), and {use.name}" in refused
         no_text = analysed(**{name: {"value": 0.05, "flag": 3}})
-        assert f"{name} is flagged (3), and a move" in refusal(no_text, MOVE)
-    assert "tip_mass_kg is flagged" in refusal(analysed(tip_mass_kg=flagged(1e-4)), MOVE)
+        assert f"{name} is flagged (3), and a move" in refusal(no_text, MOVE_USE)
+    assert "tip_mass_kg is flagged" in refusal(analysed(tip_mass_kg=flagged(1e-4)), MOVE_USE)
 
 
 def test_touch_uses_the_deviation_of_a_flagged_damping(analysed):
     path = analysed(gamma=flagged(0.05, interval_95=[0.03, 0.07]))
-    assert read_identified_beam(path, STATED, TOUCH).parameter_stds["gamma"] == pytest.approx(
+    assert read_identified_beam(path, STATED, TOUCH_USE).parameter_stds["gamma"] == pytest.approx(
         0.0102, 1e-2
     )
     path = analysed(gamma={"value": 0.05, "std": None, "flag": "not identifiable"})
-    assert "gamma is flagged" in refusal(path, TOUCH)
-    assert "gamma" not in read_identified_beam(path, STATED, MOVE).parameter_stds
+    assert "gamma is flagged" in refusal(path, TOUCH_USE)
+    assert "gamma" not in read_identified_beam(path, STATED, MOVE_USE).parameter_stds
 
 
 def test_the_uncertainty_of_the_poles_is_that_of_the_modes(analysed):
@@ -179,9 +179,9 @@ def test_the_uncertainty_of_the_poles_is_that_of_the_modes(analysed):
         }
 
     modes = [mode(1, 0.03, 0.004), mode(2, 0.1, 0.0)]
-    found = read_identified_beam(changed(analysed(), modes=modes), STATED, MOVE)
+    found = read_identified_beam(changed(analysed(), modes=modes), STATED, MOVE_USE)
     assert found.pole_uncertainty(3) == pytest.approx((0.005, 0.01, 0.01))
-    assert "modes[0] is not mode 1" in refusal(changed(analysed(), modes=[mode(2, 0, 0)]), MOVE)
+    assert "modes[0] is not mode 1" in refusal(changed(analysed(), modes=[mode(2, 0, 0)]), MOVE_USE)
 
 
 def quantity(value, std=0.0, flag=None):
@@ -216,7 +216,7 @@ def test_exact_parameters_of_a_uniform_beam_are_read(analysed, profile):
     loaded = Plant(profile.rig.beam, profile.rig.damping)
     changes = {"validity": PASSED, "exact_geometry": {"parameters": exact, "modes": shown(loaded)}}
     path = analysed(density_over_stiffness={"value": 0.06, "std": 1e-4}, alpha=flagged(1.2))
-    for use in (MOVE, TOUCH):
+    for use in (MOVE_USE, TOUCH_USE):
         found = read_identified_beam(changed(path, **changes), STATED, use)
         assert found.plant.damping == profile.rig.damping
         assert found.plant.beam.density_kg_per_m == pytest.approx(profile.rig.beam.density_kg_per_m)
@@ -232,25 +232,27 @@ def test_nonuniform_beam_is_accepted_by_moves_only(analysed, profile):
         ("tip_mass_kg", 1e-4),
     )}  # fmt: skip
     path = changed(analysed(**effective), validity=REFUSED, modes=shown(true))
-    assert "validity.uniform_beam: a uniform beam does not predict" in refusal(path, TOUCH)
-    found = read_identified_beam(path, STATED, MOVE)
+    assert "validity.uniform_beam: a uniform beam does not predict" in refusal(path, TOUCH_USE)
+    found = read_identified_beam(path, STATED, MOVE_USE)
     assert found.plant.stiffness_offsets == pytest.approx((0.02, -0.03), abs=1e-5)
     assert found.plant.beam.density_kg_per_m == pytest.approx(5.1e-3)
     assert found.plant.beam.bending_stiffness_n_m2 == pytest.approx(0.1)
     assert found.plant.tip_mass_kg == 0.0
     assert max(found.pole_uncertainty(3)) < 1e-3
     doubtful = changed(path, modes=shown(true, flag="part of the record is unexplained"))
-    assert "modes: a uniform beam does not predict" in refusal(doubtful, MOVE)
+    assert "modes: a uniform beam does not predict" in refusal(doubtful, MOVE_USE)
     # Of a campaign one such record is enough.
     document = json.loads(changed(path, modes=shown(true)).read_text())
     pooled = {**document["headlines"][0], "file": None, "validity": {"uniform_beam": None}}
     path.write_text(json.dumps({"headlines": [*document["headlines"], pooled]}))
     with pytest.raises(IdentifiedBeamError, match="does not predict the modes"):
-        read_identified_beam(path, STATED, TOUCH)
+        read_identified_beam(path, STATED, TOUCH_USE)
 
 
 def test_damping_unlike_that_of_modes_counts_as_uncertainty(analysed, profile):
     modes = shown(Plant(profile.rig.beam, profile.rig.damping))
     modes[0]["damping_ratio"]["value"] += 0.002
-    found = read_identified_beam(changed(analysed(), validity=REFUSED, modes=modes), STATED, MOVE)
+    found = read_identified_beam(
+        changed(analysed(), validity=REFUSED, modes=modes), STATED, MOVE_USE
+    )
     assert found.pole_uncertainty(2) == pytest.approx((0.002, 7e-5), rel=0.1)

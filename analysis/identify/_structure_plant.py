@@ -60,7 +60,7 @@ class StructurePlant(Plant):
         at = self.rigid_clamp_response(s)
         clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
         torque = at.response * clamp_factor + self.tool_inertia_kg_m2 * s_squared
-        by_density = at.by_inertial * self.beam.density_over_stiffness * s_squared
+        by_density = at.slope_by_inertial_factor * self.beam.density_over_stiffness * s_squared
         derivatives = {
             "ln_density_over_stiffness": by_density * clamp_factor**2,
             "ln_stiffness": at.response * clamp_factor**2,
@@ -71,7 +71,8 @@ class StructurePlant(Plant):
             if parameter.name in wrt:
                 by_elastic, by_external = self._factor_slopes(s, parameter)
                 derivatives[parameter.name] = (
-                    at.by_elastic * by_elastic + at.by_inertial * by_external
+                    at.slope_by_elastic_factor * by_elastic
+                    + at.slope_by_inertial_factor * by_external
                 ) * clamp_factor**2
         rows = np.stack([torque, *(derivatives[name] for name in wrt)])
         return rows * (self.channel_response(s) * angle_spectrum)

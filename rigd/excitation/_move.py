@@ -115,7 +115,7 @@ def move(
         "ring_down_s": ring_down_s,
         "limits_share": planned_move.limit_fraction,
         "residual_nm": move_end.residual_nm,
-        "residual_floor_nm": move_end.floor_nm,
+        "residual_floor_nm": move_end.noise_floor_nm,
         "frequency_residual_nm": planned_move.residual_nm,
         "quintic_residual_nm": planned_move.quintic_residual_nm,
     }

@@ -109,5 +109,5 @@ def predict_move_end(rig: DisturbedRig, reference_rad: RealArray, ring_down_s: f
     return MoveEnd(
         arrival_s=arrival_tick / rate_hz if arrival_tick < angles_rad.shape[0] - 1 else None,
         residual_nm=float(np.sqrt((mode_amplitudes**2).sum(axis=0).mean())),
-        floor_nm=float(np.sqrt(_SQUARED_AMPLITUDE_QUANTILE_999 * amplitude_variances.sum())),
+        noise_floor_nm=float(np.sqrt(_SQUARED_AMPLITUDE_QUANTILE_999 * amplitude_variances.sum())),
     )

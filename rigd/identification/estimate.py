@@ -181,11 +181,11 @@ _SMOOTHED_BINS = 9
 class _MotorFit:
     """Estimated unknowns of the motor's equation, with standard deviations and diagnostics."""
 
-    values: RealArray
+    unknown_values: RealArray
     """Estimates: torque scale, inertia, viscous and Coulomb friction, delay from command to angle,
     and the sessions' zeros of the torque."""
-    stds: RealArray
-    """Standard deviations of `values`; 0 for a scale that is not estimated."""
+    unknown_stds: RealArray
+    """Standard deviations of `unknown_values`; 0 for a scale that is not estimated."""
     misfit: float
     """Ratio of the residual's mean square to that expected from the scatter of the repeats."""
     friction_departure_nm: float
@@ -491,9 +491,9 @@ def estimate_motor(
     motor_fit = _fit_equation(repeat_stacks, timing, fixes_torque_scale=False)
     is_scale_known = (
         motor_fit is not None
-        and motor_fit.stds[SCALE_INDEX] < _MAX_TORQUE_SCALE_STD
+        and motor_fit.unknown_stds[SCALE_INDEX] < _MAX_TORQUE_SCALE_STD
         and _PLAUSIBLE_TORQUE_SCALES[0]
-        < motor_fit.values[SCALE_INDEX]
+        < motor_fit.unknown_values[SCALE_INDEX]
         < _PLAUSIBLE_TORQUE_SCALES[1]
     )
     if not is_scale_known:
@@ -504,7 +504,7 @@ def estimate_motor(
             "Check actuation.delay_s of the profile, from which the search begins, and the "
             "record."
         )
-    fitted_values, stds = motor_fit.values, motor_fit.stds
+    fitted_values, stds = motor_fit.unknown_values, motor_fit.unknown_stds
     inertia_kg_m2 = float(fitted_values[INERTIA_INDEX])
     if inertia_kg_m2 <= 0.0:
         raise MotorEstimateError(

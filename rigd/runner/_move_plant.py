@@ -97,7 +97,7 @@ def move_plant_of(
     return MovePlant(
         rate_hz=loop_model.rate_hz,
         respond=uncompensated_loop.simulate,
-        disturbed=respond_disturbed,
+        respond_disturbed=respond_disturbed,
         poles_rad_s=closed_loop_poles,
         torque_per_state_nm_s=torque_per_angle
         * np.abs(uncompensated_loop.response(np.abs(closed_loop_poles) / (2.0 * math.pi))),

@@ -205,7 +205,7 @@ def _beam_torques(rig: ProbedRig, angle_rad: RealArray) -> RealArray:
         highest_hz=_WINDOW_CUTOFF_HZ,
     )
     s = transform.s
-    angle_spectrum = transform.forward(angle_rad, hold=True)
+    angle_spectrum = transform.forward(angle_rad, holds_last_value=True)
     torques_nm = np.empty((len(_FREQUENCY_FACTORS), n))
     for row, frequency_factor in zip(torques_nm, _FREQUENCY_FACTORS, strict=True):
         bending_stiffness_n_m2 = rig.beam.bending_stiffness_n_m2 * frequency_factor**2

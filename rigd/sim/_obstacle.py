@@ -106,7 +106,7 @@ class AttachedObstacles:
             state_output(
                 realisation,
                 partial(_displacement_per_angle, beam, damping, x),
-                inertial=False,
+                has_inertial_term=False,
                 response_floor=_SMALL_DISPLACEMENT_RATIO * x,
             )
             for x in positions_m.tolist()

@@ -99,8 +99,8 @@ class ImpactResponse:
     ) -> ParameterRanges:
         """Return bounds and step sizes of the four parameters of an impact."""
         return ParameterRanges(
-            low=np.array([position_range_m[0], instant_range_s[0], np.log(3e-4), -100.0]),
-            high=np.array([position_range_m[1], instant_range_s[1], np.log(0.1), 100.0]),
+            lower_limits=np.array([position_range_m[0], instant_range_s[0], np.log(3e-4), -100.0]),
+            upper_limits=np.array([position_range_m[1], instant_range_s[1], np.log(0.1), 100.0]),
             derivative_step=np.array([2e-4, 2e-5, 1e-2, 1e-3]),
             significant_change=np.array([3e-3, 1e-3, 0.3, 0.5]),
             smallest_std=np.array([1.5e-4, 1e-5, 2e-2, 5e-3]),

@@ -384,7 +384,7 @@ def _fit_filter(
 def _is_represented_mode(upper_poles: ComplexArray, rate_hz: float) -> NDArray[np.bool_]:
     """Return a mask of the poles whose modes the filter represents.
 
-    These are oscillating modes below `_MAX_FREQUENCY_FRACTION` of the tick rate; poles that are NaN
+    These are oscillating modes below `_MAX_FREQUENCY_PER_RATE` of the tick rate; poles that are NaN
     are excluded.
     """
     is_represented: NDArray[np.bool_] = upper_poles.imag > _MIN_IMAGINARY_FRACTION * np.abs(

@@ -165,10 +165,10 @@ class ObstacleFit:
         """Return bounds and step sizes of the first `parameter_count` `OBSTACLE_PARAMETERS`."""
         t = self.motion.t
         return ParameterRanges(
-            low=np.array(
+            lower_limits=np.array(
                 [self.position_range_m[0], t[self.quiet_samples + 1], MIN_LN_STIFFNESS, -3.0, 0.0]
             )[:parameter_count],
-            high=np.array(
+            upper_limits=np.array(
                 [self.position_range_m[1], t[self.detection_index], MAX_LN_STIFFNESS, 3.0, 50.0]
             )[:parameter_count],
             derivative_step=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:parameter_count],

@@ -218,7 +218,7 @@ class TwoObstacleContact:
     def parameter_ranges(single_obstacle_ranges: ParameterRanges) -> ParameterRanges:
         """Return bounds and step sizes for two obstacles, from those of one obstacle at rest."""
         return ParameterRanges(
-            low=np.concatenate(
+            lower_limits=np.concatenate(
                 [
                     single_obstacle_ranges.lower_limits,
                     [
@@ -228,7 +228,7 @@ class TwoObstacleContact:
                     ],
                 ]
             ),
-            high=np.concatenate(
+            upper_limits=np.concatenate(
                 [
                     single_obstacle_ranges.upper_limits,
                     [

@@ -257,7 +257,7 @@ class ResponseCharts:
         is_coherent = is_excited
         if corrected_response.coherence is not None:
             is_coherent = is_excited & (corrected_response.coherence >= LOW_COHERENCE)
-        decimate_to_strips = self._thinning.strips
+        decimate_to_strips = self._thinning.curve_strips
         self._curves, self._uncertain = {}, {}
         for response_curve in self._response_curves:
             curve_values, entity_path = (

@@ -35,7 +35,7 @@ def touch_session(run_patched):
     """
     command = ["touch", "0.6", "--passes", "2", "--fast", "--json", "--no-look", *QUICK]
     command += ["--obstacle", OBSTACLE]
-    patches = {"rigd.touch._tables._SPACING_M": 0.02}
+    patches = {"rigd.touch._tables._POSITION_SPACING_M": 0.02}
     code, output, errors = run_patched("touched", command, patches, TOUCH)
     session, touches = touches_of(subprocess.CompletedProcess([], code, output, errors))
     return errors, session, touches, read_session(session["path"])

@@ -48,7 +48,7 @@ def followed():
         requests, reports = [], []
         job = TouchJob(None, 0, RATE_HZ, None, None, SimpleNamespace() if realtime else None)
         follower = RunningTouchEstimator(
-            SimpleNamespace(follow=lambda: RecordingFollower(requests)), job
+            SimpleNamespace(growing_estimator=lambda: RecordingFollower(requests)), job
         )
         for first, last in zip([0, *ends], ends, strict=False):
             follower.add_samples(samples(first, last, *touches, off=off and last == ends[-1]))

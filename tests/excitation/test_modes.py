@@ -87,10 +87,10 @@ def test_each_sweep_covers_only_its_band(document):
 
 
 def test_band_has_half_power_widths_and_uncertainty():
-    band = Band.around_mode(FoundMode(16.0, 0.005, 0.1), widths=2.0)
+    band = Band.around_mode(FoundMode(16.0, 0.005, 0.1), half_power_widths=2.0)
     assert (band.start_hz, band.stop_hz) == pytest.approx((16 - 0.42, 16 + 0.42))
     assert band.decay_s == pytest.approx(1 / (2 * np.pi * 16 * 0.005))
-    heavy = Band.around_mode(FoundMode(2.0, 0.6, 0.0), widths=2.0)
+    heavy = Band.around_mode(FoundMode(2.0, 0.6, 0.0), half_power_widths=2.0)
     assert 0 < heavy.start_hz < heavy.stop_hz
 
 

@@ -58,7 +58,9 @@ def test_unreported_scale_is_not_proposed(profile):
 
 
 def test_misfit_and_missing_passes_are_reported(profile):
-    notes = propose(replace(ESTIMATE, misfit=7.3, dropped=2), profile, unusable_count=3).notes
+    notes = propose(
+        replace(ESTIMATE, misfit=7.3, dropped_window_count=2), profile, unusable_count=3
+    ).notes
     assert any("7.3 times" in note for note in notes)
     assert any("5 of 77 passes were left out" in note for note in notes)
     quiet = propose(ESTIMATE, profile).notes

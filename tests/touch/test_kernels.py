@@ -18,6 +18,7 @@ from rigd.touch._kernels import (
 )
 
 STEP_S = 1 / 8000
+KERNEL_NAMES = ("displacement_m_per_n", "torque_nm_per_n", "shear_per_n")
 
 
 @pytest.fixture(scope="module")
@@ -71,16 +72,16 @@ def test_cross_kernels_match_exact_model():
 def test_constant_force_has_static_response():
     damped = Damping(zeta=0.02, alpha=1.0)
     kernels = contact_kernels(LINK, damped, np.array([0.4]), 2.5e-4, 16000)
-    static = {name: getattr(kernels, name)[0].sum() for name in ("torque", "shear", "displacement")}
-    assert static["shear"] == pytest.approx(-1.0, abs=2e-3)
-    assert static["torque"] == pytest.approx(-0.4, abs=2e-3)
+    static = {name: getattr(kernels, name)[0].sum() for name in KERNEL_NAMES}
+    assert static["shear_per_n"] == pytest.approx(-1.0, abs=2e-3)
+    assert static["torque_nm_per_n"] == pytest.approx(-0.4, abs=2e-3)
     compliance = 0.4**3 / (3 * LINK.bending_stiffness_n_m2)
-    assert static["displacement"] == pytest.approx(compliance, rel=5e-3)
+    assert static["displacement_m_per_n"] == pytest.approx(compliance, rel=5e-3)
 
 
 def test_interpolated_kernels_match_exact_ones(kernels, at_point):
     between = kernels.at_positions(np.array([0.62]), 400)
-    for name in ("displacement", "torque", "shear"):
+    for name in KERNEL_NAMES:
         exact = getattr(at_point, name)
         assert np.abs(getattr(between, name) - exact).max() < 1e-4 * np.abs(exact).max()
 
@@ -88,7 +89,7 @@ def test_interpolated_kernels_match_exact_ones(kernels, at_point):
 def test_wider_hats_are_sums_of_narrow_ones(at_point):
     wide = contact_kernels(LINK, DAMPED, np.array([0.62]), 4 * STEP_S, 90)
     summed = at_point.with_wider_pulses(4, 90)
-    for name in ("displacement", "torque", "shear"):
+    for name in KERNEL_NAMES:
         exact = getattr(wide, name)
         assert np.abs(getattr(summed, name) - exact).max() < 2e-4 * np.abs(exact).max()
 
@@ -116,7 +117,7 @@ def test_chebyshev_interpolation_of_a_wave():
 def test_averaged_kernels_are_means_of_delayed_ones(at_point):
     mean = SensorFilter(weights=(0.25,) * 4, spacing_s=2 * STEP_S)
     filtered = contact_kernels(LINK, DAMPED, np.array([0.62]), STEP_S, 400, mean)
-    for name in ("torque", "shear"):
+    for name in ("torque_nm_per_n", "shear_per_n"):
         unfiltered = getattr(at_point, name)[0]
         delayed = [np.concatenate([np.zeros(2 * i), unfiltered[: 400 - 2 * i]]) for i in range(4)]
         assert getattr(filtered, name)[0] == pytest.approx(

@@ -176,7 +176,7 @@ def test_empty_coherence_chart_states_the_reason(description, shown):
     single = replace(known, response=replace(known.response, coherence=None))
     charts.update(1_000_000_000, single)
     assert note() == ["Coherence begins with the second segment"]
-    charts.update(2_000_000_000, replace(single, final=True))
+    charts.update(2_000_000_000, replace(single, is_final=True))
     assert note() == ["A single segment gives no coherence"]
     charts.update(3_000_000_000, known)
     assert note() == []
