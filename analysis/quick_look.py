@@ -479,7 +479,7 @@ def _text_lines(quick_look_document: Mapping[str, Any]) -> Iterator[str]:
     modes = modes_from_json(quick_look_document["modes"])
     shown_modes = [mode for mode in modes if mode.shown]
     for mode in shown_modes:
-        yield f"  {mode.line()}"
+        yield f"  {mode.summary_line()}"
     if shown_modes:
         validity = Validity.from_document(quick_look_document.get("validity"))
         yield f"  {validity.sentence}"

@@ -394,7 +394,7 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
         raise SessionError(
             f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
-    return TouchModel.assumed(
+    return TouchModel.with_assumed_uncertainty(
         replace(undamped_plant, damping=damping), angle_delay_s, sensor_filter
     )
 

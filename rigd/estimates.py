@@ -234,14 +234,14 @@ class ReportedMode:
         decimal_count = decimals(self.frequency_hz.std) if self.frequency_hz.std else 4
         return f"{change_hz:+.{decimal_count}f} Hz"
 
-    def line(self) -> str:
+    def summary_line(self) -> str:
         """Return one line of text with frequency, damping and inertia.
 
         Examples
         --------
         >>> from rigd.estimates import Estimate, ReportedMode
         >>> frequency_hz = Estimate(2.5699, 6e-4, (2.5687, 2.5711))
-        >>> print(ReportedMode(1, frequency_hz, Estimate(0.00909, None, None)).line())
+        >>> print(ReportedMode(1, frequency_hz, Estimate(0.00909, None, None)).summary_line())
         mode 1: 2.5699 ± 0.0012 Hz, damping 0.909 %
         """
         mode_text = f"mode {self.number}: {self.frequency_hz.text()} Hz, damping {self.damping_ratio.text(100.0)} %"

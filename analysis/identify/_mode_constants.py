@@ -39,8 +39,8 @@ class BeamVibration:
 
     `parameters` are the values of `analysis.identify.uniform_beam.PARAMETERS`, those in
     `LOGARITHMIC_PARAMETERS` as logarithms, and `terms` the Galerkin coefficients of the modes.
-    `lags` are the lags of the torque channel as in `rigd.beam.Plant.lags`, and `expected_rad_s`
-    approximate poles.
+    `lags` are the lags of the torque channel as in `rigd.beam.Plant.filter_denominators`, and
+    `expected_roots_rad_s` approximate poles.
     """
 
     __slots__ = ("_modes",)
@@ -51,10 +51,12 @@ class BeamVibration:
         terms: ModeTerms,
         length_m: float,
         lags: Sequence[tuple[float, float]],
-        expected_rad_s: Sequence[complex],
+        expected_roots_rad_s: Sequence[complex],
     ) -> None:
         self._modes: list[_Mode | None] = []
-        for coefficients, near in zip(terms.coefficients_by_mode(), expected_rad_s, strict=True):
+        for coefficients, near in zip(
+            terms.coefficients_by_mode(), expected_roots_rad_s, strict=True
+        ):
             try:
                 mode = _Mode(parameters, terms, coefficients, length_m, lags, near)
             except (ArithmeticError, ValueError):  # the iterations end at no pole
@@ -86,7 +88,7 @@ class _Mode:
         coefficients: Sequence[complex],
         length_m: float,
         lags: Sequence[tuple[float, float]],
-        expected_rad_s: complex,
+        expected_roots_rad_s: complex,
     ) -> None:
         ln_zeta, alpha, ln_gamma, lambda_, ln_ratio, ln_stiffness, self._delay_s = parameters
         self._ln_coefficients, self._orders = (ln_zeta, ln_gamma), (alpha, lambda_)
@@ -104,7 +106,7 @@ class _Mode:
         self._mass = mass + lump
         self._tension, self._tension_arm = self._ratio * tension, self._ratio * tension_arm
         self._static_stiffness = self._stiffness + clamp + self._tension
-        self._pole = s = self._find_pole(expected_rad_s)
+        self._pole = s = self._find_pole(expected_roots_rad_s)
         _, self._slope, self._dampings, self._inertia = self._stiffness_at(s)
         # Damping turns the mode shape, and with it the arm of the mass.
         self._arms = (

@@ -48,13 +48,16 @@ class StructurePlant(Plant):
         return elastic, self.beam.density_over_stiffness * s * s + external
 
     def torque_spectra(
-        self, s: NDArray[np.complex128], wrt: Sequence[str], angle_spectrum: NDArray[np.complex128]
+        self,
+        s: NDArray[np.complex128],
+        gradient_parameters: Sequence[str],
+        angle_spectrum: NDArray[np.complex128],
     ) -> NDArray[np.complex128]:
         """Return the transforms of the torque and its derivatives, like `ResponseGrid.evaluate`.
 
         `s`, shape (n,), is the Laplace variable in rad/s, not 0, and `angle_spectrum` the transform
-        of the motor angle. `wrt` names parameters of the structure, or settings as `gradient_name`
-        has them.
+        of the motor angle. `gradient_parameters` names parameters of the structure, or settings as
+        `gradient_name` has them.
         """
         s_squared = s * s
         at = self.rigid_clamp_response(s)
@@ -68,13 +71,13 @@ class StructurePlant(Plant):
             "tool_inertia_kg_m2": s_squared,
         }
         for parameter in self.structure.parameters:
-            if parameter.name in wrt:
+            if parameter.name in gradient_parameters:
                 by_elastic, by_external = self._factor_slopes(s, parameter)
                 derivatives[parameter.name] = (
                     at.slope_by_elastic_factor * by_elastic
                     + at.slope_by_inertial_factor * by_external
                 ) * clamp_factor**2
-        rows = np.stack([torque, *(derivatives[name] for name in wrt)])
+        rows = np.stack([torque, *(derivatives[name] for name in gradient_parameters)])
         return rows * (self.channel_response(s) * angle_spectrum)
 
     def _factor_slopes(
@@ -98,11 +101,11 @@ class StructurePlant(Plant):
     def mode_poles(
         self,
         mode_count: int,  # noqa: ARG002 - that of `decay_poles`
-        wrt: Sequence[str] = (),
-        expected_rad_s: Sequence[complex] = (),  # noqa: ARG002 - nothing is searched
+        gradient_parameters: Sequence[str] = (),
+        expected_roots_rad_s: Sequence[complex] = (),  # noqa: ARG002 - nothing is searched
     ) -> tuple[Pole, ...]:
-        """Return `decay_poles`, with derivatives of 0 by the parameters `wrt`."""
-        zero_derivative = np.zeros(len(wrt), dtype=np.complex128)
+        """Return `decay_poles`, with derivatives of 0 by the parameters `gradient_parameters`."""
+        zero_derivative = np.zeros(len(gradient_parameters), dtype=np.complex128)
         return tuple(replace(pole, derivative=zero_derivative) for pole in self.decay_poles)
 
     def loss_factor(self, omega_rad_s: float) -> float:

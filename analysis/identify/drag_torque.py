@@ -372,7 +372,7 @@ class DragResponse:
         `modal_speeds`, shape (1 + modes, n), are the speeds of rotation and of each mode.
         """
         point_speed_m_s: RealArray = np.outer(modal_speeds[0], self._grid.x_m)
-        for mode_shape, modal_speed in zip(self._grid.shapes, modal_speeds[1:], strict=True):
+        for mode_shape, modal_speed in zip(self._grid.mode_shapes, modal_speeds[1:], strict=True):
             point_speed_m_s += np.outer(modal_speed, mode_shape)
         return point_speed_m_s
 
@@ -382,7 +382,7 @@ class DragResponse:
         The array is changed in place.
         """
         speed_per_state, state_transition, state_per_modal_force = self._time_step_matrices()
-        step_matrix = np.concatenate([self._grid.shapes.T @ speed_per_state, state_transition])
+        step_matrix = np.concatenate([self._grid.mode_shapes.T @ speed_per_state, state_transition])
         state_per_force = state_per_modal_force @ self._grid.modal_force_matrix
         modal_state, force_per_m, speed_magnitude = (
             np.zeros(len(state_transition)),
@@ -428,7 +428,9 @@ class DragResponse:
             [state_per_modal_force, np.zeros((len(state_per_modal_force), 1))]
         )  # the moment is no input
         run_count, force_weights = len(speed_sources) + 2, self._point_to_modal_forces
-        mode_pair_weights = (force_weights[:, None] * self._grid.shapes).reshape(-1, DRAG_POINTS).T
+        mode_pair_weights = (
+            (force_weights[:, None] * self._grid.mode_shapes).reshape(-1, DRAG_POINTS).T
+        )
         force_changes = np.empty((len(speed_m_s), len(force_weights), run_count))
         modal_state, out = (
             np.zeros((len(state_transition), run_count)),

@@ -231,7 +231,7 @@ class UniformBeamProblem:
             self.parameters(x).tolist(),
             terms,
             self.nominal.beam.length_m,
-            self.nominal.lags + terms.alteration.lags,
+            self.nominal.filter_denominators + terms.alteration.lags,
             self._measured_poles,
         )
 

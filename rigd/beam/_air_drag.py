@@ -38,33 +38,33 @@ class DragGrid:
     """Distance of each point from the motor's axis, shape (g,)."""
     quadrature_weight_m: RealArray
     """Quadrature weight of each point, a length of beam, shape (g,)."""
-    shapes: RealArray
+    mode_shapes: RealArray
     """Mode shapes at the points, shape (n, g), each of mean square 1 over the beam."""
     shape_moment_m: RealArray
     """First moment ``b_i = ∫ x phi_i dx / L`` of each mode shape phi_i, shape (n,)."""
 
     @classmethod
-    def along_beam(cls, beam: Beam, modes: int, points: int) -> "DragGrid":
+    def along_beam(cls, beam: Beam, mode_count: int, point_count: int) -> "DragGrid":
         """Return a grid of Gauss-Legendre points along a beam.
 
         Parameters
         ----------
         beam
             Beam; only its length is used.
-        modes
+        mode_count
             Number of modes whose shapes are evaluated.
-        points
+        point_count
             Number of points of the Gauss-Legendre rule. The force is smooth except for kinks where
             the speed changes its sign along the beam.
         """
-        nodes, point_weights = np.polynomial.legendre.leggauss(points)
+        nodes, point_weights = np.polynomial.legendre.leggauss(point_count)
         x_over_length = 0.5 * (nodes + 1)
-        mode_numbers = np.arange(1, modes + 1)
-        z = clamped_free_eigenvalues(modes)
+        mode_numbers = np.arange(1, mode_count + 1)
+        z = clamped_free_eigenvalues(mode_count)
         return cls(
             x_m=beam.length_m * x_over_length,
             quadrature_weight_m=0.5 * beam.length_m * point_weights,
-            shapes=np.array(
+            mode_shapes=np.array(
                 [mode_shape(int(mode_number), x_over_length) for mode_number in mode_numbers]
             ),
             shape_moment_m=2 * beam.length_m * (-1.0) ** (mode_numbers - 1) / z**2,
@@ -74,7 +74,7 @@ class DragGrid:
     def modal_force_matrix(self) -> RealArray:
         """Matrix that converts force per metre at the points into modal forces, shape (n, g)."""
         length_m = self.quadrature_weight_m.sum()
-        modal_projection: RealArray = self.shapes * self.quadrature_weight_m / length_m
+        modal_projection: RealArray = self.mode_shapes * self.quadrature_weight_m / length_m
         return modal_projection
 
     @property

@@ -75,16 +75,16 @@ class ForceRealisation:
 
     A realisation of the same beam up to a higher frequency has all these poles and additional modal
     and real ones."""
-    modes: int
+    mode_count: int
     """Number of modes in the state space."""
     b: RealArray
     """Input vector of the force, shape (n,)."""
-    rows: RealArray
+    output_rows: RealArray
     """Output matrix, shape (outputs, n).
 
     The outputs are the displacement at each output point (m), then the torque (N·m) and the shear
     force (N) of the motor on the beam."""
-    direct: RealArray
+    feedthrough: RealArray
     """Direct term: immediate change of each output per N of the force, shape (outputs,)."""
 
 
@@ -116,7 +116,7 @@ def realise_force(
     >>> from rigd.beam import Beam, Damping, realise_force
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> pushed = realise_force(beam, Damping(zeta=7e-5), 0.6, np.array([0.6]), 1e4)
-    >>> static = pushed.direct - pushed.rows @ np.linalg.solve(pushed.a, pushed.b)
+    >>> static = pushed.feedthrough - pushed.output_rows @ np.linalg.solve(pushed.a, pushed.b)
     >>> print(static.round(3))  # m/N, N·m/N, N/N
     [ 0.797 -0.6   -1.   ]
     """

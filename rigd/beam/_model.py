@@ -169,15 +169,15 @@ class TransferGrid:
         return g.reshape(self.shape)
 
     def evaluate_with_gradient(
-        self, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
+        self, beam: Beam, damping: Damping, gradient_parameters: Sequence[str] = GRADIENT_NAMES[:4]
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return the coupling torque per motor angle and its derivatives for the parameters `wrt`.
+        """Return the coupling torque per motor angle and its derivatives for given parameters.
 
         Parameters
         ----------
         beam, damping
             Parameters at which G is evaluated.
-        wrt
+        gradient_parameters
             Names from `GRADIENT_NAMES`. ``ln_density_over_stiffness`` is ln(rho/EI) at constant EI,
             ``ln_stiffness`` is ln(EI) at constant rho/EI and gamma.
 
@@ -185,15 +185,15 @@ class TransferGrid:
         -------
         g : complex ndarray, shape of the grid
             Coupling torque per motor angle in N·m/rad.
-        gradient : complex ndarray, shape ``(len(wrt), *grid shape)``
-            Derivative of `g` with respect to each parameter of `wrt`.
+        gradient : complex ndarray, shape ``(len(gradient_parameters), *grid shape)``
+            Derivative of `g` with respect to each parameter of `gradient_parameters`.
 
         Raises
         ------
         ValueError
             If a name is not one of `GRADIENT_NAMES`.
         """
-        unknown_names = set(wrt) - set(GRADIENT_NAMES)
+        unknown_names = set(gradient_parameters) - set(GRADIENT_NAMES)
         if unknown_names:
             raise ValueError(
                 f"{sorted(unknown_names)} are not parameters of G: choose from {GRADIENT_NAMES}."
@@ -201,7 +201,7 @@ class TransferGrid:
         minus_stiffness_per_length = -beam.bending_stiffness_n_m2 / beam.length_m
         stiffness_length_cubed = beam.bending_stiffness_n_m2 * beam.length_m**3
         g = np.empty(self._s_squared.size, dtype=np.complex128)
-        gradient = np.empty((len(wrt), g.size), dtype=np.complex128)
+        gradient = np.empty((len(gradient_parameters), g.size), dtype=np.complex128)
         for grid_slice in self._grid_slices:
             s_alpha = self._power_of_s(damping.alpha, grid_slice)
             s_lambda = self._power_of_s(damping.lambda_, grid_slice)
@@ -212,7 +212,9 @@ class TransferGrid:
             internal_term = (minus_stiffness_per_length * s_alpha) * remainder
             f_slope *= stiffness_length_cubed
             external_term = s_lambda * f_slope
-            for row, parameter_name in zip(gradient[:, grid_slice], wrt, strict=True):
+            for row, parameter_name in zip(
+                gradient[:, grid_slice], gradient_parameters, strict=True
+            ):
                 match parameter_name:
                     case "zeta":
                         row[:] = internal_term
@@ -227,7 +229,7 @@ class TransferGrid:
                         np.multiply(inertial_term, f_slope, out=row)
                     case "ln_stiffness":
                         row[:] = g[grid_slice]
-        return g.reshape(self.shape), gradient.reshape(len(wrt), *self.shape)
+        return g.reshape(self.shape), gradient.reshape(len(gradient_parameters), *self.shape)
 
     def _power_of_s(self, order: float, grid_slice: slice) -> ComplexArray:
         """Return ``s^order`` at the points of s in a slice of the grid."""
@@ -288,9 +290,12 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> ComplexArray:
 
 
 def transfer_and_gradient(
-    s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
+    s: ArrayLike,
+    beam: Beam,
+    damping: Damping,
+    gradient_parameters: Sequence[str] = GRADIENT_NAMES[:4],
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return the coupling torque per motor angle at `s` and its derivatives for parameters `wrt`.
+    """Return the coupling torque per motor angle at `s` and its derivatives for parameters.
 
     Parameters
     ----------
@@ -298,15 +303,15 @@ def transfer_and_gradient(
         Laplace variable in rad/s, of any shape.
     beam, damping
         Parameters of the exact model.
-    wrt
+    gradient_parameters
         Names from `GRADIENT_NAMES`: see `TransferGrid.evaluate_with_gradient`.
 
     Returns
     -------
     g : complex ndarray, shape of `s`
         Coupling torque per motor angle in N·m/rad.
-    gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
-        Derivative of `g` with respect to each parameter of `wrt`.
+    gradient : complex ndarray, shape ``(len(gradient_parameters), *shape of s)``
+        Derivative of `g` with respect to each parameter of `gradient_parameters`.
 
     Raises
     ------
@@ -323,7 +328,7 @@ def transfer_and_gradient(
     >>> g.shape, gradient.shape
     ((3,), (4, 3))
     """
-    return TransferGrid(s).evaluate_with_gradient(beam, damping, wrt)
+    return TransferGrid(s).evaluate_with_gradient(beam, damping, gradient_parameters)
 
 
 def _evaluate_polynomials(coefficients: RealArray, x: ComplexArray) -> ComplexArray:

@@ -254,7 +254,7 @@ def poles(beam: Beam, damping: Damping, mode_count: int) -> ComplexArray:
 
 
 def poles_for_eigenvalues(
-    z: RealArray, beam: Beam, damping: Damping, expected_rad_s: ComplexArray | None = None
+    z: RealArray, beam: Beam, damping: Damping, expected_roots_rad_s: ComplexArray | None = None
 ) -> ComplexArray:
     """Return the pole pair of each mode from its eigenvalue z, shape (len(z), 2), in rad/s.
 
@@ -268,7 +268,7 @@ def poles_for_eigenvalues(
         Clamped–free eigenvalues, or roots of ``tan z = tanh z``, shape (m,).
     beam, damping
         Parameters of the exact model.
-    expected_rad_s
+    expected_roots_rad_s
         Expected roots in the upper half plane, shape (m,). If all of them are within the relative
         distance `SAME_ROOT_TOLERANCE` of the true roots, the search starts from them, which is ten
         times faster than a start from the roots of the undamped beam.
@@ -281,8 +281,8 @@ def poles_for_eigenvalues(
         return _second_order_poles(
             omega_squared, external_coefficient + damping.zeta * omega_squared
         )
-    if expected_rad_s is not None and bool((expected_rad_s.imag > 0).all()):
-        start_log_poles = np.log(expected_rad_s)
+    if expected_roots_rad_s is not None and bool((expected_roots_rad_s.imag > 0).all()):
+        start_log_poles = np.log(expected_roots_rad_s)
         log_poles = _newton_roots(
             start_log_poles, omega_squared, external_coefficient, damping.zeta, damping
         )
@@ -304,9 +304,13 @@ def poles_for_eigenvalues(
 
 
 def pole_gradient(
-    pole_rad_s: complex, k4_per_m4: float, beam: Beam, damping: Damping, wrt: Sequence[str]
+    pole_rad_s: complex,
+    k4_per_m4: float,
+    beam: Beam,
+    damping: Damping,
+    gradient_parameters: Sequence[str],
 ) -> ComplexArray:
-    """Return the derivatives of a mode's pole with respect to parameters, shape (len(wrt),).
+    """Return the derivatives of a mode's pole with respect to k parameters, shape (k,).
 
     The derivatives follow by implicit differentiation of the mode's characteristic equation
     ``rho/EI s² + gamma s^lambda + k⁴ (1 + zeta s^alpha) = 0``, where k = z/L is the mode's wave
@@ -330,7 +334,10 @@ def pole_gradient(
         "ln_density_over_stiffness": density_ratio * s * s,
     }
     return np.array(
-        [-derivatives.get(parameter_name, 0.0) / equation_slope for parameter_name in wrt],
+        [
+            -derivatives.get(parameter_name, 0.0) / equation_slope
+            for parameter_name in gradient_parameters
+        ],
         dtype=np.complex128,
     )
 

@@ -136,14 +136,14 @@ class Plant:
         """
         attribute_changes: dict[str, Any] = {}
         damping_changes: dict[str, float] = {}
-        offsets = dict(enumerate(self.stiffness_offsets, start=2))
+        stiffness_offset_by_mode = dict(enumerate(self.stiffness_offsets, start=2))
         for name, value in values.items():
             if name in DAMPING_PARAMETERS:
                 damping_changes[_ATTRIBUTE_NAMES.get(name, name)] = value
             elif name in _PLANT_PARAMETERS:
                 attribute_changes[name] = value
             elif name.startswith(OFFSET_PREFIX):
-                offsets[int(name.removeprefix(OFFSET_PREFIX))] = value
+                stiffness_offset_by_mode[int(name.removeprefix(OFFSET_PREFIX))] = value
             elif name not in BEAM_PARAMETERS:
                 raise ValueError(f"{name!r} is not a parameter of a plant.")
         if not values.keys().isdisjoint(BEAM_PARAMETERS):
@@ -156,7 +156,8 @@ class Plant:
         if damping_changes:
             attribute_changes["damping"] = replace(self.damping, **damping_changes)
         attribute_changes["stiffness_offsets"] = tuple(
-            offsets.get(mode_number, 0.0) for mode_number in range(2, max(offsets, default=1) + 1)
+            stiffness_offset_by_mode.get(mode_number, 0.0)
+            for mode_number in range(2, max(stiffness_offset_by_mode, default=1) + 1)
         )
         return replace(self, **attribute_changes)
 
@@ -280,31 +281,34 @@ class Plant:
         return response / (1 + self.root_compliance_rad_per_nm * response)
 
     def transfer_and_gradient(
-        self, s: ArrayLike, wrt: Sequence[str]
+        self, s: ArrayLike, gradient_parameters: Sequence[str]
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return the coupling torque per motor angle and its derivatives for the parameters `wrt`.
+        """Return the coupling torque per motor angle and its derivatives for given parameters.
 
         Parameters
         ----------
         s
             Laplace variable in rad/s, not 0.
-        wrt
+        gradient_parameters
             Names of `rigd.beam.GRADIENT_NAMES`, ``tip_mass_kg`` and ``root_compliance_rad_per_nm``.
 
         Returns
         -------
         transfer : complex ndarray, shape of `s`
             Coupling torque per motor angle in N·m/rad.
-        gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
+        gradient : complex ndarray, shape ``(len(gradient_parameters), *shape of s)``
             Derivative of `transfer` with respect to each parameter.
         """
         s = np.asarray(s, dtype=np.complex128)
-        if self.is_uniform_cantilever and set(wrt) <= set(GRADIENT_NAMES):
-            return TransferGrid(s).evaluate_with_gradient(self.beam, self.damping, wrt)
+        if self.is_uniform_cantilever and set(gradient_parameters) <= set(GRADIENT_NAMES):
+            return TransferGrid(s).evaluate_with_gradient(
+                self.beam, self.damping, gradient_parameters
+            )
         clamped_response, derivative_functions = self._response_and_slopes(s)
         clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * clamped_response.response)
         gradient = np.array(
-            [derivative_functions[parameter_name]() for parameter_name in wrt], dtype=np.complex128
+            [derivative_functions[parameter_name]() for parameter_name in gradient_parameters],
+            dtype=np.complex128,
         )
         return clamped_response.response * clamp_factor, gradient * clamp_factor * clamp_factor
 
@@ -318,19 +322,24 @@ class Plant:
         """
         s = np.asarray(s, dtype=np.complex128)
         response: ComplexArray = np.exp(-self.delay_s * s)
-        for linear_coefficient, quadratic_coefficient in self.lags:
+        for linear_coefficient, quadratic_coefficient in self.filter_denominators:
             response /= 1 + s * (linear_coefficient + s * quadratic_coefficient)
         return response
 
     @property
-    def lags(self) -> tuple[tuple[float, float], ...]:
+    def filter_denominators(self) -> tuple[tuple[float, float], ...]:
         """Coefficients of s and s² in the denominators of the torque channel's filters."""
         first_s, second_s = self.filter_time_constant_s, self.second_order_filter_time_constant_s
-        lags = ((first_s, 0.0), (_BUTTERWORTH_RECIPROCAL_Q * second_s, second_s * second_s))
-        return tuple(lag for lag in lags if any(lag))
+        filter_denominators = (
+            (first_s, 0.0),
+            (_BUTTERWORTH_RECIPROCAL_Q * second_s, second_s * second_s),
+        )
+        return tuple(lag for lag in filter_denominators if any(lag))
 
-    def pole_gradients(self, poles_rad_s: ComplexArray, wrt: Sequence[str]) -> ComplexArray:
-        """Return the derivatives of poles with respect to parameters, shape (n, len(wrt)).
+    def pole_gradients(
+        self, poles_rad_s: ComplexArray, gradient_parameters: Sequence[str]
+    ) -> ComplexArray:
+        """Return the derivatives of n poles with respect to k parameters, shape (n, k).
 
         The poles are treated as roots of ``1/G + kappa``. At the pole of a beam on a rigid clamp G
         is infinite, but close to the pole the ratios of its derivatives are accurate.
@@ -339,7 +348,7 @@ class Plant:
         ----------
         poles_rad_s : ndarray of complex, shape (n,)
             Poles, as returned by `poles`.
-        wrt
+        gradient_parameters
             Parameter names as for `transfer_and_gradient`. The derivative with respect to a
             parameter that does not affect the poles is 0.
         """
@@ -347,8 +356,8 @@ class Plant:
         s = poles_rad_s * (1 - pole_distance)
         clamped_response, derivative_functions = self._response_and_slopes(s)
         response_slope = self.derivative_by_s(s, clamped_response)
-        gradients = np.zeros((s.size, len(wrt)), dtype=np.complex128)
-        for gradient_column, parameter_name in zip(gradients.T, wrt, strict=True):
+        gradients = np.zeros((s.size, len(gradient_parameters)), dtype=np.complex128)
+        for gradient_column, parameter_name in zip(gradients.T, gradient_parameters, strict=True):
             if parameter_name in derivative_functions:
                 gradient_column[:] = -derivative_functions[parameter_name]() / response_slope
         return gradients
@@ -439,7 +448,7 @@ class Plant:
         )
         return tip_force
 
-    def shear(self, s: ComplexArray) -> ComplexArray:
+    def shear_response(self, s: ComplexArray) -> ComplexArray:
         """Return the motor's transverse force on the beam per motor angle in N/rad at `s`."""
         self._require_uniform()
         force_grid = PointForceGrid(s, self.beam, self.damping)
@@ -520,7 +529,7 @@ class Plant:
         )
         return slope_by_log_s / s
 
-    def poles(self, z: RealArray, expected_rad_s: ComplexArray | None = None) -> ComplexArray:
+    def poles(self, z: RealArray, expected_roots_rad_s: ComplexArray | None = None) -> ComplexArray:
         """Return both poles of each mode with locked hub, shape (len(z), 2), in rad/s.
 
         The poles are followed from those of the beam on a rigid clamp without a tip mass while mass
@@ -530,7 +539,7 @@ class Plant:
         ----------
         z : ndarray
             Clamped-free eigenvalues of the modes.
-        expected_rad_s : ndarray of complex, shape (len(z),), optional
+        expected_roots_rad_s : ndarray of complex, shape (len(z),), optional
             Expected poles in the upper half plane in rad/s, one per mode, from which the search
             starts.
 
@@ -540,11 +549,11 @@ class Plant:
             Conjugate pairs (positive frequency first) or two real poles. A row is NaN if the pole
             could not be followed.
         """
-        if expected_rad_s is not None and bool((expected_rad_s.imag > 0).all()):
+        if expected_roots_rad_s is not None and bool((expected_roots_rad_s.imag > 0).all()):
             upper_poles = self._newton_roots(
-                expected_rad_s, CLOSE_START_TOLERANCE, find_zeros=False
+                expected_roots_rad_s, CLOSE_START_TOLERANCE, find_zeros=False
             )
-            if bool((np.abs(upper_poles / expected_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
+            if bool((np.abs(upper_poles / expected_roots_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
                 return np.column_stack([upper_poles, upper_poles.conj()])
         return self._follow_roots(z, find_zeros=False)
 
@@ -560,14 +569,14 @@ class Plant:
 
     def _follow_roots(self, z: RealArray, *, find_zeros: bool) -> ComplexArray:
         """Return poles or zeros, followed from those of the uniform beam with eigenvalues `z`."""
-        offsets = np.array(self.stiffness_offsets)
-        if not find_zeros and offsets.size:
+        stiffness_offsets = np.array(self.stiffness_offsets)
+        if not find_zeros and stiffness_offsets.size:
             # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
             z = z.copy()
-            z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
+            z[1 : 1 + stiffness_offsets.size] *= (1 + stiffness_offsets[: z.size - 1]) ** 0.25
         roots = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
         has_ideal_ends = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
-        if has_ideal_ends and not (find_zeros and offsets.any()):
+        if has_ideal_ends and not (find_zeros and stiffness_offsets.any()):
             return roots
         relative_change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
         stiffness_nm_per_rad = self.beam.bending_stiffness_n_m2 / self.beam.length_m
@@ -575,7 +584,9 @@ class Plant:
             relative_change, self.root_compliance_rad_per_nm * stiffness_nm_per_rad
         )
         if find_zeros:
-            relative_change = max(relative_change, float(np.abs(offsets).max(initial=0.0)))
+            relative_change = max(
+                relative_change, float(np.abs(stiffness_offsets).max(initial=0.0))
+            )
 
         def roots_near(
             change_fraction: float, start_roots: ComplexArray, step_tolerance: float
@@ -584,7 +595,9 @@ class Plant:
                 self,
                 tip_mass_kg=change_fraction * self.tip_mass_kg,
                 root_compliance_rad_per_nm=change_fraction * self.root_compliance_rad_per_nm,
-                stiffness_offsets=tuple((change_fraction if find_zeros else 1.0) * offsets),
+                stiffness_offsets=tuple(
+                    (change_fraction if find_zeros else 1.0) * stiffness_offsets
+                ),
             )
             return partial_plant._newton_roots(start_roots, step_tolerance, find_zeros=find_zeros)
 
@@ -610,9 +623,12 @@ class Plant:
         return newton_roots(newton_step, s, step_tolerance)
 
     def mode_poles(
-        self, mode_count: int, wrt: Sequence[str] = (), expected_rad_s: Sequence[complex] = ()
+        self,
+        mode_count: int,
+        gradient_parameters: Sequence[str] = (),
+        expected_roots_rad_s: Sequence[complex] = (),
     ) -> tuple[Pole, ...]:
-        """Return the poles of the first modes, with their derivatives for the parameters `wrt`.
+        """Return the poles of the first modes, with their derivatives for given parameters.
 
         A mode for which no pole is found is left out.
 
@@ -620,13 +636,15 @@ class Plant:
         ----------
         mode_count
             Number of modes.
-        wrt
+        gradient_parameters
             Names of parameters as for `transfer_and_gradient`. The derivative with respect to a
             parameter that does not affect the poles is 0.
-        expected_rad_s
+        expected_roots_rad_s
             Approximate poles in the order of the modes, if all are known.
         """
-        start_poles = np.array(expected_rad_s) if len(expected_rad_s) == mode_count > 0 else None
+        start_poles = (
+            np.array(expected_roots_rad_s) if len(expected_roots_rad_s) == mode_count > 0 else None
+        )
         z = clamped_free_eigenvalues(mode_count)
         has_end_parameters = bool(self.tip_mass_kg or self.root_compliance_rad_per_nm)
         if has_end_parameters:
@@ -646,13 +664,15 @@ class Plant:
             if not np.isnan(pole_pair).any()
             for pole in pole_pair[: 1 if pole_pair[0].imag else 2]
         ]
-        if has_end_parameters or not set(END_PARAMETERS).isdisjoint(wrt):
+        if has_end_parameters or not set(END_PARAMETERS).isdisjoint(gradient_parameters):
             poles_rad_s = np.array([pole for _, pole in modes_and_poles], dtype=np.complex128)
-            derivatives = [*self.pole_gradients(poles_rad_s, wrt)]
+            derivatives = [*self.pole_gradients(poles_rad_s, gradient_parameters)]
         else:
             k4_per_m4 = (z / self.beam.length_m) ** 4
             derivatives = [
-                pole_gradient(pole, float(k4_per_m4[mode_index]), self.beam, self.damping, wrt)
+                pole_gradient(
+                    pole, float(k4_per_m4[mode_index]), self.beam, self.damping, gradient_parameters
+                )
                 for mode_index, pole in modes_and_poles
             ]
         return tuple(

@@ -48,7 +48,7 @@ class ResponseGrid:
     def evaluate(
         self,
         plant: Plant,
-        wrt: Sequence[str] = (),
+        gradient_parameters: Sequence[str] = (),
         angle_transform: NDArray[np.complex128] | float = 1.0,
     ) -> NDArray[np.complex128]:
         """Return the Laplace transform of a plant's torque for a motor angle, and its derivatives.
@@ -59,7 +59,7 @@ class ResponseGrid:
         ----------
         plant : Plant
             Plant whose torque is computed.
-        wrt : sequence of str
+        gradient_parameters : sequence of str
             Names of k parameters: `GRADIENT_NAMES`, "delay_s", "tool_inertia_kg_m2".
             The torque is differentiated with respect to each while all others are constant.
         angle_transform : ndarray of complex, shape (n,), or float
@@ -68,9 +68,9 @@ class ResponseGrid:
         Returns
         -------
         ndarray of complex, shape (1 + k, n)
-            Transform of the torque, then the derivatives in the order of `wrt`.
+            Transform of the torque, then the derivatives in the order of `gradient_parameters`.
         """
-        total_response, derivatives = self._beam_response(plant, wrt)
+        total_response, derivatives = self._beam_response(plant, gradient_parameters)
         if plant.root_compliance_rad_per_nm:
             clamp_factor = 1 / (1 + plant.root_compliance_rad_per_nm * total_response)
             for parameter_name in derivatives:
@@ -79,27 +79,34 @@ class ResponseGrid:
         total_response += plant.tool_inertia_kg_m2 * self._s_squared
         derivatives["tool_inertia_kg_m2"] = self._s_squared
         channel_times_angle = plant.channel_response(self._s) * angle_transform
-        if "delay_s" in wrt:
+        if "delay_s" in gradient_parameters:
             derivatives["delay_s"] = -self._s * total_response
-        spectra = np.empty((1 + len(wrt), channel_times_angle.size), dtype=np.complex128)
+        spectra = np.empty(
+            (1 + len(gradient_parameters), channel_times_angle.size), dtype=np.complex128
+        )
         for out, response_row in zip(
             spectra,
-            [total_response, *(derivatives[parameter_name] for parameter_name in wrt)],
+            [
+                total_response,
+                *(derivatives[parameter_name] for parameter_name in gradient_parameters),
+            ],
             strict=True,
         ):
             np.multiply(response_row, channel_times_angle, out=out)
         return spectra
 
     def _beam_response(
-        self, plant: Plant, wrt: Sequence[str]
+        self, plant: Plant, gradient_parameters: Sequence[str]
     ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
         """Return the transfer function G of the beam on a rigid clamp, and its derivatives.
 
         G is the torque over the motor angle, in N·m/rad. The derivatives are with respect to the
-        parameters in `wrt` on which G depends, by the parameters' names.
+        parameters in `gradient_parameters` on which G depends, by the parameters' names.
         """
         beam_parameter_names = [
-            parameter_name for parameter_name in wrt if parameter_name in GRADIENT_NAMES
+            parameter_name
+            for parameter_name in gradient_parameters
+            if parameter_name in GRADIENT_NAMES
         ]
         if plant.tip_mass_kg or plant.stiffness_offsets:
             loaded_response, derivatives = differentiated_response(

@@ -99,7 +99,7 @@ class Realisation:
     poles_rad_s: ComplexArray
     """Poles, shape (m,): of each conjugate pair the one with positive imaginary part, then the
     real poles."""
-    modes: NDArray[np.intp]
+    mode_indices: NDArray[np.intp]
     """Index of each pole's mode, shape (m,), from 0; -1 for a pole of the branch cut."""
 
     def transfer(self, s: ArrayLike) -> ComplexArray:

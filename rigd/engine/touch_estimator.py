@@ -178,7 +178,9 @@ class RunningTouchEstimator:
     ) -> TouchReport:
         """Return the estimate of a touch from the samples up to a number of ticks after it."""
         record, start_s = self._record_around_touch(pending_touch, ticks_after_touch)
-        touch_estimate = pending_touch.estimate.update(record, scan=False, is_first=not is_final)
+        touch_estimate = pending_touch.estimate.update(
+            record, includes_likelihoods=False, is_first=not is_final
+        )
         estimate_document = touch_estimate.as_dict(start_s)
         return TouchReport(
             pending_touch.touch_number, pending_touch.tick, is_final, estimate_document

@@ -274,7 +274,7 @@ class SweepRig(Protocol):
     def beam(self) -> Beam:
         """Beam of the rig's profile."""
 
-    def tracking(self, frequency_hz: RealArray) -> ComplexArray:
+    def tracking_response(self, frequency_hz: RealArray) -> ComplexArray:
         """Return the frequency response from reference to angle at some frequencies in Hz."""
 
     def fraction_of_limits(self, reference_rad: RealArray) -> float:
@@ -397,7 +397,7 @@ def _information_rates(
             [damping_factors[parameter_name] for parameter_name in parameter_names]
         )[:, None]
         whitened_rows = np.concatenate([gradient, [-s * g, s * s]])
-        whitened_rows *= amplitude_rad * rig.tracking(frequency_hz)
+        whitened_rows *= amplitude_rad * rig.tracking_response(frequency_hz)
         information_rates.append(
             (whitened_rows.conj() @ whitened_rows.T).real / _FREQUENCIES_PER_BAND
         )
@@ -542,7 +542,7 @@ def modes(
     return assemble_excitation("modes", parameters, rate_hz, segments, reference_rad)
 
 
-def _read_bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Band]:
+def _read_bands(path: Path, stop_hz: float, half_power_widths: float, rate_hz: float) -> list[Band]:
     """Read modes from a document and return their bands, that of the slowest decay first."""
     all_modes = read_modes(path)
     modes_in_band = [found_mode for found_mode in all_modes if found_mode.frequency_hz <= stop_hz]
@@ -552,12 +552,12 @@ def _read_bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> li
             f"above stop_hz = {stop_hz:g} Hz; raise stop_hz."
         )
     sweep_bands = sorted(
-        (Band.around_mode(found_mode, widths) for found_mode in modes_in_band),
+        (Band.around_mode(found_mode, half_power_widths) for found_mode in modes_in_band),
         key=lambda sweep_band: -sweep_band.decay_s,
     )
     for sweep_band in sweep_bands:
         require_frequency(
-            f"The upper end of a band of {widths:g} widths", sweep_band.stop_hz, rate_hz
+            f"The upper end of a band of {half_power_widths:g} widths", sweep_band.stop_hz, rate_hz
         )
     return sweep_bands
 

@@ -131,68 +131,75 @@ def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
 # Checks of options
 
 
-def to_whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
+def to_whole_ticks(option_name: str, option_value_s: float, rate_hz: float) -> int:
     """Convert a time in s to ticks; raise `ExcitationError` unless it is a whole number of ticks.
 
-    `option` is the name of the option in the message.
+    `option_name` is the name of the option in the message.
     """
-    tick_count = round(value_s * rate_hz)
-    if tick_count < 2 or abs(tick_count / rate_hz - value_s) > 1e-9 * value_s:
+    tick_count = round(option_value_s * rate_hz)
+    if tick_count < 2 or abs(tick_count / rate_hz - option_value_s) > 1e-9 * option_value_s:
         raise ExcitationError(
-            f"{option} = {value_s:g} s is not a whole number of ticks at {rate_hz:g} Hz; choose "
+            f"{option_name} = {option_value_s:g} s is not a whole number of ticks at "
+            f"{rate_hz:g} Hz; choose "
             f"for example {max(tick_count, 2) / rate_hz:g} s."
         )
     return tick_count
 
 
-def require_finite(option: str, value: float, unit: str) -> None:
+def require_finite(option_name: str, option_value: float, unit: str) -> None:
     """Raise `ExcitationError` if an option's value is not finite, or implausible for any rig."""
-    if not isfinite(value):
-        raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
-    if not is_usable_size(value):
+    if not isfinite(option_value):
         raise ExcitationError(
-            f"{option} = {value:g} {unit} is not plausible for a rig; check its unit."
+            f"{option_name} = {option_value} {unit} is not a finite number; give one."
+        )
+    if not is_usable_size(option_value):
+        raise ExcitationError(
+            f"{option_name} = {option_value:g} {unit} is not plausible for a rig; check its unit."
         )
 
 
-def require_positive(option: str, value: float, unit: str) -> None:
+def require_positive(option_name: str, option_value: float, unit: str) -> None:
     """Raise `ExcitationError` unless an option's value is a finite number above 0."""
-    require_finite(option, value, unit)
-    if value <= 0.0:
-        raise ExcitationError(f"{option} = {value:g} {unit} must be more than 0 {unit}.")
-
-
-def require_not_negative(option: str, value: float) -> None:
-    """Raise `ExcitationError` unless an option's time is finite and at least 0 s."""
-    require_finite(option, value, "s")
-    if value < 0.0:
-        raise ExcitationError(f"{option} = {value:g} s must not be negative.")
-
-
-def require_within_turn(option: str, value_rad: float) -> None:
-    """Raise `ExcitationError` if an option's angle is more than a full turn to either side."""
-    if abs(value_rad) > 2.0 * pi:
+    require_finite(option_name, option_value, unit)
+    if option_value <= 0.0:
         raise ExcitationError(
-            f"{option} = {value_rad:g} rad is more than a full turn; give an angle in rad of at "
+            f"{option_name} = {option_value:g} {unit} must be more than 0 {unit}."
+        )
+
+
+def require_not_negative(option_name: str, option_value: float) -> None:
+    """Raise `ExcitationError` unless an option's time is finite and at least 0 s."""
+    require_finite(option_name, option_value, "s")
+    if option_value < 0.0:
+        raise ExcitationError(f"{option_name} = {option_value:g} s must not be negative.")
+
+
+def require_within_turn(option_name: str, option_value_rad: float) -> None:
+    """Raise `ExcitationError` if an option's angle is more than a full turn to either side."""
+    if abs(option_value_rad) > 2.0 * pi:
+        raise ExcitationError(
+            f"{option_name} = {option_value_rad:g} rad is more than a full turn; give an angle "
+            "in rad of at "
             f"most {2.0 * pi:.3f}."
         )
 
 
 def require_frequency(
-    option: str, value: float, rate_hz: float, *, zero_allowed: bool = False
+    option_name: str, option_value: float, rate_hz: float, *, zero_allowed: bool = False
 ) -> None:
     """Raise `ExcitationError` unless a frequency is above 0 Hz and at most a quarter of the rate.
 
     With `zero_allowed`, 0 Hz is valid as well.
     """
-    require_finite(option, value, "Hz")
+    require_finite(option_name, option_value, "Hz")
     max_frequency_hz = rate_hz / MIN_SAMPLES_PER_PERIOD
-    if not (value > 0.0 or (zero_allowed and value == 0.0)):
+    if not (option_value > 0.0 or (zero_allowed and option_value == 0.0)):
         bound_text = "must not be negative" if zero_allowed else "must be more than 0 Hz"
-        raise ExcitationError(f"{option} = {value:g} Hz {bound_text}.")
-    if value > max_frequency_hz:
+        raise ExcitationError(f"{option_name} = {option_value:g} Hz {bound_text}.")
+    if option_value > max_frequency_hz:
         raise ExcitationError(
-            f"{option} = {value:g} Hz leaves fewer than {MIN_SAMPLES_PER_PERIOD} samples per "
+            f"{option_name} = {option_value:g} Hz leaves fewer than {MIN_SAMPLES_PER_PERIOD} "
+            "samples per "
             f"period at {rate_hz:g} Hz; choose at most {max_frequency_hz:g} Hz."
         )
 

@@ -166,7 +166,10 @@ def largest_factor(existing_motion: RealArray, added_motion: RealArray) -> float
 
 def describe_candidate(chosen_candidate: SegmentCandidate) -> str:
     """Return a text for the operator with modes, bands, duration and amplitudes of a segment."""
-    sorted_parts = sorted(chosen_candidate.bands_and_amplitudes, key=lambda part: part[0].middle_hz)
+    sorted_parts = sorted(
+        chosen_candidate.bands_and_amplitudes,
+        key=lambda band_and_amplitude: band_and_amplitude[0].middle_hz,
+    )
     band_texts = [
         f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"
         if band.half_width_hz

@@ -158,7 +158,7 @@ class Precision:
     """Reason why no record can determine the quantity; empty if a record can."""
 
     @property
-    def ratio(self) -> float:
+    def std_to_target_ratio(self) -> float:
         """Ratio of the standard deviation to the requested one; 1 or less: reached."""
         if self.impossible_reason:
             return inf
@@ -167,7 +167,7 @@ class Precision:
     @property
     def reached(self) -> bool:
         """Whether the quantity's standard deviation has reached its target."""
-        return self.ratio <= 1.0
+        return self.std_to_target_ratio <= 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -98,13 +98,13 @@ _MAX_UNREMARKED_MISFIT = 1.5
 class ProposalRow:
     """Comparison of a number of the profile with its estimate."""
 
-    key: str
+    profile_key: str
     """Dotted key of the number in the profile."""
     measured_quantity: MotorQuantity
     """Estimate of the number."""
     profile_value: float
     """Value of the number in the profile."""
-    source: str
+    value_source: str
     """Origin of the profile's value, as the profile states it."""
     min_allowed: float = 0.0
     """Smallest value that the profile's other settings allow."""
@@ -112,7 +112,7 @@ class ProposalRow:
     @property
     def unit(self) -> str:
         """Unit of the compared numbers."""
-        return unit_of(self.key)
+        return unit_of(self.profile_key)
 
     @property
     def is_below_min_allowed(self) -> bool:
@@ -144,7 +144,7 @@ class ProposalRow:
         value_text, std_text = _format_with_std(self.measured_quantity.value, std)
         if not self.is_below_min_allowed and float(value_text) < self.min_allowed:
             value_text = f"{self.min_allowed:g}"
-        key_name = self.key.rpartition(".")[2]
+        key_name = self.profile_key.rpartition(".")[2]
         return (
             f'{key_name} = {{ value = {value_text}, source = "measured" }}  # ± {std_text} '
             f"{self.unit}"
@@ -176,11 +176,11 @@ class Proposal:
             verdict_text = {True: "DIFFERS", False: "agrees", None: ""}[row.differs]
             table_cells.append(
                 (
-                    row.key,
+                    row.profile_key,
                     f"{value_text} {row.unit}" if std_text else value_text,
                     std_text,
                     f"{row.profile_value:g}",
-                    row.source,
+                    row.value_source,
                     verdict_text,
                 )
             )
@@ -201,7 +201,7 @@ class Proposal:
         for row in self.rows:
             if row.measured_quantity.std is None:
                 continue
-            row_section = row.key.rpartition(".")[0]
+            row_section = row.profile_key.rpartition(".")[0]
             if row_section != current_section:
                 current_section = row_section
                 toml_lines += [""] * bool(toml_lines) + [f"[{current_section}]"]
@@ -213,12 +213,12 @@ class Proposal:
         torque_scale = self.estimate.torque_scale
         return {
             "parameters": {
-                row.key: {
+                row.profile_key: {
                     "value": row.measured_quantity.value,
                     "std": row.measured_quantity.std,
                     "unit": row.unit,
                     "profile": row.profile_value,
-                    "source": row.source,
+                    "source": row.value_source,
                     "differs": row.differs,
                 }
                 for row in self.rows
@@ -257,7 +257,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
         ("motor.coulomb_nm", estimate.coulomb_nm, rig_motor.coulomb_nm),
         (
             "motor.rated_torque_nm",
-            _scaled(rig_motor.rated_torque_nm, estimate.torque_scale),
+            _scaled_quantity(rig_motor.rated_torque_nm, estimate.torque_scale),
             rig_motor.rated_torque_nm,
         ),
         ("actuation.delay_s", estimate.actuation_delay_s, rig.actuation.delay_s),
@@ -271,7 +271,9 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
         # It converts the drive's own rated torque for the comparison: both change by one factor.
         unit_nm = rig.cia402.rated_torque_unit_nm
         torque_key = "cia402.rated_torque_unit_nm"
-        compared_numbers.append((torque_key, _scaled(unit_nm, estimate.torque_scale), unit_nm))
+        compared_numbers.append(
+            (torque_key, _scaled_quantity(unit_nm, estimate.torque_scale), unit_nm)
+        )
     is_torque_at_sync = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
     smallest_values = {"actuation.delay_s": 1 / rig.rate_hz} if is_torque_at_sync else {}
     proposal_rows = tuple(
@@ -282,8 +284,8 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
         )
         for compared_number in compared_numbers
     )
-    operator_notes = _notes(estimate, profile, unusable_count)
-    if any(row.is_below_min_allowed for row in proposal_rows if row.key in smallest_values):
+    operator_notes = _operator_notes(estimate, profile, unusable_count)
+    if any(row.is_below_min_allowed for row in proposal_rows if row.profile_key in smallest_values):
         operator_notes.append(
             "The torque acts before the next SYNC: this drive takes it on arrival, whatever the "
             'type of its RPDO. Set cia402.torque_delivery = "on_arrival" together with the delay.'
@@ -291,13 +293,13 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
     return Proposal(estimate, proposal_rows, tuple(operator_notes))
 
 
-def _scaled(factor: float, quantity: MotorQuantity) -> MotorQuantity:
+def _scaled_quantity(scale_factor: float, quantity: MotorQuantity) -> MotorQuantity:
     """Return a quantity whose value and standard deviation are multiplied by a factor."""
-    std = None if quantity.std is None else factor * quantity.std
-    return MotorQuantity(factor * quantity.value, std)
+    std = None if quantity.std is None else scale_factor * quantity.std
+    return MotorQuantity(scale_factor * quantity.value, std)
 
 
-def _notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> list[str]:
+def _operator_notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> list[str]:
     """Return the sentences for the operator on assumptions and defects of the estimate."""
     torque_scale = estimate.torque_scale
     if torque_scale.std is None:

@@ -147,7 +147,7 @@ def _read_passes(
                 speed_rad_s=speed_pass.speed_rad_s,
                 highest_frequency_hz=HIGHEST_FREQUENCY_HZ[excitation_name],
                 session=session_number,
-                key=(session_number, speed_pass.speed_rad_s),
+                motion_key=(session_number, speed_pass.speed_rad_s),
             )
         )
     return pass_readings, len(speed_passes)

@@ -193,14 +193,16 @@ class _MotorFit:
 
 
 def _fit_equation(
-    stacks: Sequence[_MotionRepeats], timing: Timing, *, fixes_torque_scale: bool
+    repeated_motions: Sequence[_MotionRepeats], timing: Timing, *, fixes_torque_scale: bool
 ) -> _MotorFit | None:
     """Return the weighted fit of the motor's equation to all motions, or None if it diverges.
 
-    The fit is iterated for the delay and the weights. Each of `stacks` has at least two repeats.
-    With `fixes_torque_scale`, the torque scale is fixed at 1.
+    The fit is iterated for the delay and the weights. Each of `repeated_motions` has at least two
+    repeats. With `fixes_torque_scale`, the torque scale is fixed at 1.
     """
-    unknown_count = ZERO_INDEX + 1 + max(motion_repeats.session for motion_repeats in stacks)
+    unknown_count = (
+        ZERO_INDEX + 1 + max(motion_repeats.session for motion_repeats in repeated_motions)
+    )
     is_estimated = (
         np.arange(unknown_count) != SCALE_INDEX
         if fixes_torque_scale
@@ -209,35 +211,35 @@ def _fit_equation(
     delay_s, torque_scale = timing.actuation_delay_s + timing.angle_delay_s, 1.0
     bin_weights: list[RealArray] = []
     for _ in range(_MAX_FIT_ITERATIONS):
-        stack_equations = [
+        equations_by_motion = [
             _motion_equations(motion_repeats, timing, delay_s, torque_scale, unknown_count)
-            for motion_repeats in stacks
+            for motion_repeats in repeated_motions
         ]
         bin_weights = bin_weights or [
-            np.ones(equations.torque_moments.shape[1]) for equations in stack_equations
+            np.ones(equations.torque_moments.shape[1]) for equations in equations_by_motion
         ]
-        solution = _solve_mean_equations(stack_equations, bin_weights, is_estimated)
+        solution = _solve_mean_equations(equations_by_motion, bin_weights, is_estimated)
         fit_residuals = [
             equations.torque_moments - equations.unknown_coefficients @ solution
-            for equations in stack_equations
+            for equations in equations_by_motion
         ]
         delay_change_s = float(solution[DELAY_INDEX])
         if abs(delay_change_s) < _DELAY_TOLERANCE_S:
             try:
                 return _finish_fit(
-                    stack_equations, bin_weights, fit_residuals, is_estimated, solution, delay_s
+                    equations_by_motion, bin_weights, fit_residuals, is_estimated, solution, delay_s
                 )
             except np.linalg.LinAlgError:  # an unknown has no effect in the record
                 return None
         delay_s, torque_scale = delay_s + delay_change_s, float(solution[SCALE_INDEX])
         if not (abs(delay_s) < _MAX_COMMAND_DELAY_S and torque_scale > 0.0):
             return None
-        bin_weights = _inverse_variances(fit_residuals, stacks)
+        bin_weights = _inverse_variances(fit_residuals, repeated_motions)
     return None
 
 
 def _solve_mean_equations(
-    stack_equations: Sequence[_MotionEquations],
+    equations_by_motion: Sequence[_MotionEquations],
     weights: Sequence[RealArray],
     is_estimated: NDArray[np.bool_],
 ) -> RealArray:
@@ -248,7 +250,7 @@ def _solve_mean_equations(
     solution = np.zeros(is_estimated.size)
     solution[SCALE_INDEX] = 1.0
     weighted_blocks, weighted_targets = [], []
-    for equations, bin_weights in zip(stack_equations, weights, strict=True):
+    for equations, bin_weights in zip(equations_by_motion, weights, strict=True):
         weight_root = np.sqrt(bin_weights)
         x, y = equations.unknown_coefficients.mean(axis=0), equations.torque_moments.mean(axis=0)
         if not is_estimated[SCALE_INDEX]:
@@ -270,7 +272,7 @@ def _solve_mean_equations(
 
 
 def _inverse_variances(
-    residuals: Sequence[ComplexArray], stacks: Sequence[_MotionRepeats]
+    residuals: Sequence[ComplexArray], repeated_motions: Sequence[_MotionRepeats]
 ) -> list[RealArray]:
     """Return the weight of each motion's mean equation at each frequency.
 
@@ -278,10 +280,12 @@ def _inverse_variances(
     pooled over the stacks of a session, which have the same noise, and over neighbouring
     frequencies.
     """
-    variances: dict[int, RealArray] = {}
-    for session_number in {motion_repeats.session for motion_repeats in stacks}:
+    variances_by_session: dict[int, RealArray] = {}
+    for session_number in {motion_repeats.session for motion_repeats in repeated_motions}:
         session_residuals = [
-            r for r, s in zip(residuals, stacks, strict=True) if s.session == session_number
+            r
+            for r, s in zip(residuals, repeated_motions, strict=True)
+            if s.session == session_number
         ]
         repeat_deviations = sum(
             np.sum(np.abs(r - r.mean(axis=0)) ** 2, axis=0) for r in session_residuals
@@ -290,17 +294,17 @@ def _inverse_variances(
         kernel_width = min(_SMOOTHED_BINS, bin_variances.size)
         smoothing_kernel = np.ones(kernel_width)
         edge_counts = np.convolve(np.ones(bin_variances.size), smoothing_kernel, "same")
-        variances[session_number] = (
+        variances_by_session[session_number] = (
             np.convolve(bin_variances, smoothing_kernel, "same") / edge_counts
         )
     return [
-        len(r) / np.maximum(variances[motion_repeats.session], np.finfo(float).tiny)
-        for r, motion_repeats in zip(residuals, stacks, strict=True)
+        len(r) / np.maximum(variances_by_session[motion_repeats.session], np.finfo(float).tiny)
+        for r, motion_repeats in zip(residuals, repeated_motions, strict=True)
     ]
 
 
 def _finish_fit(
-    stack_equations: Sequence[_MotionEquations],
+    equations_by_motion: Sequence[_MotionEquations],
     weights: Sequence[RealArray],
     residuals: Sequence[ComplexArray],
     is_estimated: NDArray[np.bool_],
@@ -312,7 +316,7 @@ def _finish_fit(
     normal_matrix = np.zeros((free_indices.size, free_indices.size))
     noise_bias = np.zeros(free_indices.size)
     for equations, bin_weight, bin_residuals in zip(
-        stack_equations, weights, residuals, strict=True
+        equations_by_motion, weights, residuals, strict=True
     ):
         repeat_count = len(equations.torque_moments)
         x = equations.unknown_coefficients[..., free_indices]
@@ -332,7 +336,7 @@ def _finish_fit(
     weighted_squares, term_count = 0.0, 0
     friction_departure_nm = 0.0
     for equations, bin_weight, bin_residuals in zip(
-        stack_equations, weights, residuals, strict=True
+        equations_by_motion, weights, residuals, strict=True
     ):
         repeat_count = len(equations.torque_moments)
         mean_equation = equations.unknown_coefficients[..., free_indices].mean(axis=0)
@@ -349,10 +353,10 @@ def _finish_fit(
         friction_departure_nm = max(
             friction_departure_nm, abs(float(mean_residual[0].real)) / float(constant_column)
         )
-    stack_variances = np.array(variance_parts)
-    unknown_variances = stack_variances.sum(axis=0)
+    variances_by_motion = np.array(variance_parts)
+    unknown_variances = variances_by_motion.sum(axis=0)
     degrees_of_freedom = unknown_variances**2 / np.sum(
-        stack_variances**2 / np.array(stack_degrees_of_freedom)[:, None], axis=0
+        variances_by_motion**2 / np.array(stack_degrees_of_freedom)[:, None], axis=0
     )
     misfit = weighted_squares / max(1.0, term_count - 0.5 * free_indices.size)
     std_widening = (
@@ -411,7 +415,7 @@ class PassReadings:
     """Highest frequency of the motion."""
     session: int
     """Number of the session, since each session has its own zero of the torque."""
-    key: Hashable
+    motion_key: Hashable
     """Key of the motion: repeats of the same motion have equal keys."""
 
 
@@ -487,8 +491,8 @@ def estimate_motor(
         for pass_readings in windows
         if _moves_throughout(pass_readings, timing.rate_hz)
     ]
-    repeat_stacks = _group_repeats(moving_windows, len(windows))
-    motor_fit = _fit_equation(repeat_stacks, timing, fixes_torque_scale=False)
+    repeated_motions = _group_repeats(moving_windows, len(windows))
+    motor_fit = _fit_equation(repeated_motions, timing, fixes_torque_scale=False)
     is_scale_known = (
         motor_fit is not None
         and motor_fit.unknown_stds[SCALE_INDEX] < _MAX_TORQUE_SCALE_STD
@@ -497,7 +501,7 @@ def estimate_motor(
         < _PLAUSIBLE_TORQUE_SCALES[1]
     )
     if not is_scale_known:
-        motor_fit = _fit_equation(repeat_stacks, timing, fixes_torque_scale=True)
+        motor_fit = _fit_equation(repeated_motions, timing, fixes_torque_scale=True)
     if motor_fit is None:
         raise MotorEstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
@@ -554,7 +558,7 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
     """
     windows_by_motion: dict[Hashable, list[PassReadings]] = {}
     for pass_readings in windows:
-        windows_by_motion.setdefault(pass_readings.key, []).append(pass_readings)
+        windows_by_motion.setdefault(pass_readings.motion_key, []).append(pass_readings)
     complete_groups = [
         repeat_group
         for repeat_group in windows_by_motion.values()

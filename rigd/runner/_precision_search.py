@@ -302,10 +302,7 @@ class ExcitationPlanner:
             self._doubtful_count = self._doubtful_count + 1 if doubt_text else 0
         if self._doubtful_count >= _MAX_DOUBTFUL_FITS:
             findings_text = " ".join(fit_document["findings"])
-            end_reason = (
-                f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: "
-                "rigd run chirp."
-            )
+            end_reason = f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: rigd run chirp."
             yield self._search_end_message(end_reason.replace("  ", " "), is_reached=False)
             return
         try:
@@ -396,7 +393,7 @@ class ExcitationPlanner:
             limit_fraction=amplitude_fraction,
         )
         if not self.may_be_last and all(
-            target_forecast.ratio <= _SUFFICIENT_STD_RATIO
+            target_forecast.std_to_target_ratio <= _SUFFICIENT_STD_RATIO
             for target_forecast in next_planned_segment.present_precisions
         ):
             self._append_pause(SEGMENT_PAUSE_S)
@@ -571,8 +568,7 @@ class ExcitationPlanner:
         )
         return [
             *table_rows,
-            f"{record_time_s:5.1f} s {row_text}"
-            f"{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
+            f"{record_time_s:5.1f} s {row_text}{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
         ]
 
     def targets_document(self, fit_document: Mapping[str, Any]) -> dict[str, Any]:
@@ -681,12 +677,7 @@ class _TimeForecast:
         else:
             required_time_text = f"about {required_s:.0f} s more"
             longer_record_text = f", or give --at-most {1.2 * (now_s + required_s):.0f}"
-        return (
-            f"it would take {required_time_text}, and the remaining {available_s:.0f} s suffice "
-            "for "
-            f"{reachable_ratio:.2g} times the requested standard deviation. Request that"
-            f"{longer_record_text}."
-        )
+        return f"it would take {required_time_text}, and the remaining {available_s:.0f} s suffice for {reachable_ratio:.2g} times the requested standard deviation. Request that{longer_record_text}."
 
 
 def _cell_text(target_estimate: TargetEstimate) -> str:
@@ -697,10 +688,7 @@ def _cell_text(target_estimate: TargetEstimate) -> str:
         (100.0, " %") if target_estimate.name.startswith("damping") else (1.0, "")
     )
     scaled_std = display_scale * target_estimate.std
-    return (
-        f"{with_half_width(display_scale * target_estimate.value, (-scaled_std, scaled_std))}"
-        f"{unit_text}"
-    )
+    return f"{with_half_width(display_scale * target_estimate.value, (-scaled_std, scaled_std))}{unit_text}"
 
 
 def targets_json(estimates: Sequence[TargetEstimate]) -> list[dict[str, Any]]:
@@ -728,7 +716,4 @@ def _estimate_text(target_estimate: TargetEstimate) -> str:
     """Return text with one estimate and its standard deviation, or why it is doubtful."""
     if target_estimate.value is None or target_estimate.doubt:
         return f"{target_estimate.name}: {target_estimate.doubt}"
-    return (
-        f"{target_estimate.name} {target_estimate.value:.5g}, standard deviation "
-        f"{with_percentage(target_estimate.std, target_estimate.value)}"
-    )
+    return f"{target_estimate.name} {target_estimate.value:.5g}, standard deviation {with_percentage(target_estimate.std, target_estimate.value)}"

@@ -68,7 +68,9 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
             analysis_path, profile.plant, rig.encoder.delay_s, sensor_filter
         )
     else:
-        touch_model = TouchModel.assumed(profile.plant, rig.encoder.delay_s, sensor_filter)
+        touch_model = TouchModel.with_assumed_uncertainty(
+            profile.plant, rig.encoder.delay_s, sensor_filter
+        )
     beam_prediction = detector_model(touch_model, rig.rate_hz, _reading_noise(profile))
     shear_projection = sensor.shear_projection if any(sensor.shear_projection) else None
     return TouchSearch(

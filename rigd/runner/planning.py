@@ -132,7 +132,7 @@ class RigPreview:
         """Stable closed loop with the beam of the profile."""
         return stable_loop(self._profile.loop_model())[0]
 
-    def tracking(self, frequency_hz: RealArray) -> ComplexArray:
+    def tracking_response(self, frequency_hz: RealArray) -> ComplexArray:
         """Return the closed loop's frequency response from reference angle to motor angle.
 
         The result has the shape of `frequency_hz`.

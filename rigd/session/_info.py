@@ -407,7 +407,7 @@ def _outcome_rows(outcome: dict[str, str], *, is_complete: bool) -> Iterator[tup
         yield "touch", touch_line(touch).removeprefix("Touch ")
     for mode in modes_from_json((fit_of(outcome) or {}).get("modes")):
         if mode.shown:
-            yield "fit", mode.line()
+            yield "fit", mode.summary_line()
     yield from (
         _rounded_row(key, outcome_value)
         for key, outcome_value in outcome.items()

@@ -37,7 +37,7 @@ def estimate_lines(
             earlier_mode = earlier_modes.get(mode.number)
             change_text = "" if earlier_mode is None else _change_text(earlier_mode, mode)
             doubt_text = f" (doubtful: {mode.flag})" if mode.flag else ""
-            report_lines.append(f"  {mode.line()}{change_text}{doubt_text}")
+            report_lines.append(f"  {mode.summary_line()}{change_text}{doubt_text}")
     if unseen_text := unseen_modes_text(modes):
         report_lines.append(f"  not visible so far: {unseen_text}")
     if uniform_beam := Validity.from_document(fit_document.get("validity")).uniform_beam:

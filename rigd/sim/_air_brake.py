@@ -105,9 +105,9 @@ class AirBrake:
         modal_rows = _real_part_rows(
             -drag_grid.shape_moment_m * load_terms / derivatives_at_poles / poles
         )
-        self.speed_rows[:, 2 : 2 + 2 * mode_count] = drag_grid.shapes.T @ modal_rows
+        self.speed_rows[:, 2 : 2 + 2 * mode_count] = drag_grid.mode_shapes.T @ modal_rows
         force_rows = _real_part_rows(poles / derivatives_at_poles / beam.bending_stiffness_n_m2)
-        self.speed_rows[:, coupled_state_count:] = drag_grid.shapes.T @ force_rows
+        self.speed_rows[:, coupled_state_count:] = drag_grid.mode_shapes.T @ force_rows
 
         self._forces = np.zeros((3, _DRAG_POINT_COUNT))
         self._magnitude = np.zeros(_DRAG_POINT_COUNT)

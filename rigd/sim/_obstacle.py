@@ -95,13 +95,13 @@ class AttachedObstacles:
         # Rows: displacement at each body, torque, shear. Columns of `_force_state_rows`: states of
         # each force; columns of `_direct_rows`: forces.
         self._force_state_rows = np.column_stack(
-            [force_realisation.rows for force_realisation in force_realisations]
+            [force_realisation.output_rows for force_realisation in force_realisations]
         )
         self._direct_rows = np.column_stack(
-            [force_realisation.direct for force_realisation in force_realisations]
+            [force_realisation.feedthrough for force_realisation in force_realisations]
         )
         self._a, self._b = force_realisations[0].a, force_realisations[0].b  # equal for all forces
-        self._oscillating_state_count = 2 * force_realisations[0].modes
+        self._oscillating_state_count = 2 * force_realisations[0].mode_count
         angle_outputs = [
             state_output(
                 realisation,

@@ -59,7 +59,7 @@ def beam_and_coupled_models(
         couple,
         beam_realisation,
         tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
-        shear=state_output(beam_realisation, plant.shear, has_inertial_term=True),
+        shear=state_output(beam_realisation, plant.shear_response, has_inertial_term=True),
     )
     free_shaft_model = attach_beam(
         motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,

@@ -164,12 +164,12 @@ def _states_from_displacements(
     initial_rate_by_mode = {
         beam_mode: abs(pole)
         for beam_mode, pole in zip(
-            initial_realisation.modes.tolist(),
+            initial_realisation.mode_indices.tolist(),
             initial_realisation.poles_rad_s.tolist(),
             strict=True,
         )
     }
-    poles, pole_modes = beam_realisation.poles_rad_s, beam_realisation.modes
+    poles, pole_modes = beam_realisation.poles_rad_s, beam_realisation.mode_indices
     first_state_of_pole = np.cumsum([0, *np.where(poles.imag > 0, 2, 1)])  # state of each pole
     state_matrix = np.zeros((beam_realisation.b.size, beam_realisation.b.size))
     column_index = 0

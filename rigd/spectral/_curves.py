@@ -92,7 +92,7 @@ class CurveDecimation:
         curve_values
             Values of the curve on the grid, shape (n,); NaN if unknown.
         """
-        group_indices, extreme_indices = self._extremes(curve_values)
+        group_indices, extreme_indices = self._group_extremes(curve_values)
         if group_indices.size == 0:
             return []
         strip_starts = np.flatnonzero(np.diff(group_indices) > 1) + 1
@@ -109,7 +109,7 @@ class CurveDecimation:
         curve_values
             Values on the grid, shape (n,); NaN if unknown.
         """
-        return np.unique(self._extremes(curve_values)[1])
+        return np.unique(self._group_extremes(curve_values)[1])
 
     def gap_edge_indices(self, curve_values: RealArray) -> npt.NDArray[np.intp]:
         """Return the increasing grid indices of the known values on both sides of each gap.
@@ -119,13 +119,13 @@ class CurveDecimation:
         curve_values
             Values on the grid, shape (n,); NaN if unknown.
         """
-        group_indices, _ = self._extremes(curve_values)
+        group_indices, _ = self._group_extremes(curve_values)
         groups_before_gaps = np.flatnonzero(np.diff(group_indices) > 1)
         first_indices = self.groups[group_indices[groups_before_gaps] + 1, 0]
         last_indices = self.groups[group_indices[groups_before_gaps + 1] - 1].max(axis=1)
         return np.unique(np.concatenate([first_indices, last_indices]))
 
-    def _extremes(
+    def _group_extremes(
         self, curve_values: RealArray
     ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
         """Return the indices of groups with known values, and the grid indices of their extremes.

@@ -136,7 +136,7 @@ class RunningResponse:
         """Return the response estimated from all samples so far; None if these are too few."""
         is_final = self._segments.over
         summed_spectra, reference_power = self._sums, self._reference_power
-        newest_samples = self._segments.newest(self._length)
+        newest_samples = self._segments.newest_samples(self._length)
         shortest_segment_length = self._length
         if self._is_newest_segment_used(newest_samples.shape[1], is_final):
             summed_spectra, reference_power = summed_spectra.copy(), reference_power.copy()
@@ -238,7 +238,7 @@ class Segments:
                     block_start, sample_block[:, block_start - first_tick : end_tick - first_tick]
                 )
 
-    def newest(self, max_samples: int) -> RealArray:
+    def newest_samples(self, max_samples: int) -> RealArray:
         """Return the newest samples without a gap, shape (channels, n), at most `max_samples`.
 
         The array is a view of the internal array.
@@ -260,16 +260,16 @@ class Segments:
                 :, added_count : added_count + min(segment_end - self.end, self._length)
             ]
             added_count += block_part.shape[1]
-            self._append(block_part)
+            self._append_samples(block_part)
             if self.end == segment_end:
-                yield self._next, self.newest(self._length)
+                yield self._next, self.newest_samples(self._length)
                 self._next += self._hop
 
-    def _append(self, new_samples: RealArray) -> None:
+    def _append_samples(self, new_samples: RealArray) -> None:
         """Append samples to the internal array, which stores at least the newest segment."""
         new_count = new_samples.shape[1]
         if self._used + new_count > self._buffer.shape[1]:
-            newest_samples = self.newest(self._length)
+            newest_samples = self.newest_samples(self._length)
             self._buffer[:, : newest_samples.shape[1]] = newest_samples
             self._used = newest_samples.shape[1]
         self._buffer[:, self._used : self._used + new_count] = new_samples

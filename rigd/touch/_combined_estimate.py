@@ -31,11 +31,11 @@ RealArray = NDArray[np.float64]
 
 _NORMAL_QUANTILE_95 = 1.959964
 """Number of standard deviations of a normal distribution's two-sided 95 % interval."""
-_BOUNCE_STDS_M = (3e-4, 5e-4)
+_BOUNCE_POSITION_STDS_M = (3e-4, 5e-4)
 """Additional standard deviations in m of the position because of bounces: of a touch far from the
 tip, and of one near the tip. With them the errors of 130 simulated touches agree with the
 intervals."""
-_TWO_OBSTACLES_STD_M = 2e-3
+_TWO_OBSTACLES_POSITION_STD_M = 2e-3
 """Additional standard deviation in m of the first obstacle's position if there are two, because
 their contact is integrated in longer time steps."""
 _EARLY_TIMES_S = (0.006, 0.01, 0.022)
@@ -47,11 +47,15 @@ ends of its interval."""
 
 
 def estimate_from_explanations(
-    explanation_search: ExplanationSearch, explained_record: ExplainedRecord, *, scan: bool
+    explanation_search: ExplanationSearch,
+    explained_record: ExplainedRecord,
+    *,
+    includes_likelihoods: bool,
 ) -> TouchEstimate:
     """Return position, instant, force and stiffness of a touch from its likeliest explanations.
 
-    With `scan` the estimate contains the likelihood of each position; otherwise that is empty.
+    With `includes_likelihoods` the estimate contains the likelihood of each position; otherwise
+    that is empty.
     """
     obstacle_fit = explanation_search.fit
     explanations, sample_window = explained_record.explanations, explained_record.window
@@ -114,8 +118,10 @@ def estimate_from_explanations(
         samples=sample_window.end_sample - obstacle_fit.detection_index,
         chi2_per_degree=best_explanation.chi2
         / (sample_window.whitened_innovations.size - best_explanation.parameters.size),
-        positions_m=obstacle_fit.any_force_likelihood.x_m if scan else np.zeros(0),
-        log_likelihood=obstacle_fit.any_force_likelihood.log_likelihood if scan else np.zeros(0),
+        positions_m=obstacle_fit.any_force_likelihood.x_m if includes_likelihoods else np.zeros(0),
+        log_likelihood=obstacle_fit.any_force_likelihood.log_likelihood
+        if includes_likelihoods
+        else np.zeros(0),
         innovations=obstacle_fit.motion.innovations / obstacle_fit.motion.noise_stds[:, None],
         innovation_times_s=obstacle_fit.motion.t + record_begin_s,
         force_history_n=force_history_n,
@@ -176,9 +182,9 @@ def _position_estimate(
         position_estimate.value > NEAR_TIP_FRACTION * obstacle_fit.tables.model.plant.beam.length_m
     )
     additional_std_m = (
-        _TWO_OBSTACLES_STD_M
+        _TWO_OBSTACLES_POSITION_STD_M
         if likely_explanations[0].kind == "two"
-        else _BOUNCE_STDS_M[int(is_near_tip)]
+        else _BOUNCE_POSITION_STDS_M[int(is_near_tip)]
     )
     low_m, high_m = (
         position_estimate.value

@@ -52,7 +52,9 @@ class TouchEstimator:
         self.model = model
         self._tables = TouchTables(model, rate_hz)
 
-    def estimate(self, touch_record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
+    def estimate(
+        self, touch_record: TouchRecord, *, includes_likelihoods: bool = True
+    ) -> TouchEstimate:
         """Return the estimate of one touch from its record.
 
         Parameters
@@ -60,10 +62,12 @@ class TouchEstimator:
         touch_record
             Samples from 0.3 s or more before the touch. More samples after the detection, up to
             0.2 s, improve the estimate.
-        scan
+        includes_likelihoods
             Whether the estimate contains the likelihood of each position; otherwise that is empty.
         """
-        return self.growing_estimator().update(touch_record, scan=scan)
+        return self.growing_estimator().update(
+            touch_record, includes_likelihoods=includes_likelihoods
+        )
 
     def growing_estimator(self) -> "GrowingEstimate":
         """Return an estimator of one touch for records that grow from call to call."""
@@ -101,11 +105,11 @@ class GrowingEstimate:
         ]:  # the last one takes long, and is hardly ever needed
             if not self._has_enough_samples(touch_record, detection_delay_s):
                 return
-            if not self._search(touch_record, detection_delay_s).begins_before_window:
+            if not self._search_at_delay(touch_record, detection_delay_s).begins_before_window:
                 return
 
     def update(
-        self, record: TouchRecord, *, scan: bool = True, is_first: bool = False
+        self, record: TouchRecord, *, includes_likelihoods: bool = True, is_first: bool = False
     ) -> TouchEstimate:
         """Return the estimate of the touch from the samples so far.
 
@@ -113,7 +117,7 @@ class GrowingEstimate:
         ----------
         record
             Samples from 0.3 s or more before the touch.
-        scan
+        includes_likelihoods
             Whether the estimate contains the likelihood of each position; otherwise that is empty.
         is_first
             Whether this is the first estimate. Only one and two obstacles at rest are then tried,
@@ -127,7 +131,7 @@ class GrowingEstimate:
         ):
             if not self._has_enough_samples(record, detection_delay_s):
                 continue
-            explanation_search = self._search(record, detection_delay_s)
+            explanation_search = self._search_at_delay(record, detection_delay_s)
             if detection_delay_s != self._explaining_delay_s and (
                 # A longer delay only if the touch may begin before the window of the shorter one.
                 explanation_search.likely_first_sample >= first_searched_sample
@@ -135,13 +139,15 @@ class GrowingEstimate:
             ):
                 continue
             touch_estimate = estimate_from_explanations(
-                explanation_search, explanation_search.explain(is_first=is_first), scan=scan
+                explanation_search,
+                explanation_search.explain(is_first=is_first),
+                includes_likelihoods=includes_likelihoods,
             )
-            if latest_estimate is None or touch_estimate.explained:
+            if latest_estimate is None or touch_estimate.is_explained:
                 latest_estimate = touch_estimate
-            if touch_estimate.explained:
+            if touch_estimate.is_explained:
                 self._explaining_delay_s = detection_delay_s
-            if touch_estimate.explained or is_first:
+            if touch_estimate.is_explained or is_first:
                 break
             first_searched_sample = explanation_search.fit.first_touch_sample
         return latest_estimate or self._empty_estimate(record)
@@ -153,7 +159,9 @@ class GrowingEstimate:
             >= _MIN_SAMPLES_BEFORE_TOUCH
         )
 
-    def _search(self, touch_record: TouchRecord, detection_delay_s: float) -> ExplanationSearch:
+    def _search_at_delay(
+        self, touch_record: TouchRecord, detection_delay_s: float
+    ) -> ExplanationSearch:
         """Return the search for explanations of a record, for one longest delay of the detection.
 
         A new search starts from the results of the search in the previous, shorter record.
@@ -169,7 +177,7 @@ class GrowingEstimate:
         """Return whether a touch probably began more than `detection_delay_s` before detection."""
         if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
-        explanation_search = self._search(touch_record, detection_delay_s)
+        explanation_search = self._search_at_delay(touch_record, detection_delay_s)
         if explanation_search.begins_before_window:
             return True
         longer_delay_s = DETECTION_DELAYS_S[DETECTION_DELAYS_S.index(detection_delay_s) + 1]
@@ -177,7 +185,7 @@ class GrowingEstimate:
             touch_record, longer_delay_s
         ):
             return False
-        longer_search = self._search(touch_record, longer_delay_s)
+        longer_search = self._search_at_delay(touch_record, longer_delay_s)
         return (
             longer_search.likely_first_sample < explanation_search.fit.first_touch_sample
             and longer_search.misfit < 0.5 * explanation_search.misfit

@@ -80,7 +80,7 @@ class ObservedBeam:
     zero."""
     observer_gain: RealArray
     """Effect of each whitened innovation on the next state, shape (n, 2)."""
-    whitening: RealArray
+    whitening_matrix: RealArray
     """Matrix from innovations in N·m and N to whitened innovations, shape (2, 2)."""
     state_count: int
     """Number n of states."""
@@ -148,14 +148,14 @@ def observed_beam(
     innovation_rows[0, n + 1] = innovation_rows[1, n + 2] = 1.0
     step_matrix[f:n, f:n] = observer.a
     step_matrix[f:n] += observer.gain @ innovation_rows
-    step_matrix[n : n + 2] = observer.whitening @ innovation_rows
-    step_matrix[n + 2 :] = observer.whitening @ prediction_rows
+    step_matrix[n : n + 2] = observer.whitening_matrix @ innovation_rows
+    step_matrix[n + 2 :] = observer.whitening_matrix @ prediction_rows
     observer_gain = np.zeros((n, 2))
     channel_count = 2 if has_shear else 1
     observer_gain[f:, :channel_count] = observer.gain[:, :channel_count] @ np.linalg.inv(
-        observer.whitening[:channel_count, :channel_count]
+        observer.whitening_matrix[:channel_count, :channel_count]
     )
-    return ObservedBeam(step_matrix, observer_gain, observer.whitening, n, channel_count)
+    return ObservedBeam(step_matrix, observer_gain, observer.whitening_matrix, n, channel_count)
 
 
 class InnovationFilter:
@@ -196,7 +196,9 @@ class InnovationFilter:
         n = self._states = model.state_count
         self._unwhitening = (0.0, 0.0)
         if model.channel_count == 2:
-            torque_coefficient, shear_coefficient = np.linalg.inv(model.whitening)[1].tolist()
+            torque_coefficient, shear_coefficient = np.linalg.inv(model.whitening_matrix)[
+                1
+            ].tolist()
             self._unwhitening = torque_coefficient, shear_coefficient
         # The zeros are the last states: without a gain they stay what they are.
         zero_state_indices = np.arange(n - model.channel_count, n)
@@ -470,7 +472,7 @@ class _Observer:
     a: RealArray
     c: RealArray
     gain: RealArray
-    whitening: RealArray
+    whitening_matrix: RealArray
     """Matrix from innovations to whitened innovations, shape (2, 2)."""
 
 
@@ -516,11 +518,11 @@ def _design_observer(
     r = np.diag(noise_variances[:channel_count])
     covariance = solve_discrete_are(a.T, measured_rows.T, np.diag(q), r)
     innovation_covariance = measured_rows @ covariance @ measured_rows.T + r
-    observer_gain, whitening = np.zeros((n, 2)), np.zeros((2, 2))
+    observer_gain, whitening_matrix = np.zeros((n, 2)), np.zeros((2, 2))
     observer_gain[:, :channel_count] = (
         a @ np.linalg.solve(innovation_covariance, measured_rows @ covariance).T
     )
-    whitening[:channel_count, :channel_count] = np.linalg.inv(
+    whitening_matrix[:channel_count, :channel_count] = np.linalg.inv(
         np.linalg.cholesky(innovation_covariance)
     )
-    return _Observer(a, c, observer_gain, whitening)
+    return _Observer(a, c, observer_gain, whitening_matrix)

@@ -68,7 +68,7 @@ class TouchModel:
         return replace(self, plant=self.plant.with_parameters({parameter_name: changed_value}))
 
     @classmethod
-    def assumed(
+    def with_assumed_uncertainty(
         cls, plant: Plant, angle_delay_s: float = 0.0, sensor_filter: SensorFilter = NO_FILTER
     ) -> "TouchModel":
         """Return the model of a beam that was not identified, with assumed uncertainties.

@@ -329,11 +329,11 @@ def find_minima(
     regularisation = 1e-6 / parameter_ranges.significant_change**2
     for _ in range(max_iterations):
         active_rows = np.flatnonzero(is_active)
-        j, r = jacobians[active_rows], current_residuals[active_rows]
+        jacobian, r = jacobians[active_rows], current_residuals[active_rows]
         if is_free_parameter is not None:
-            j = j * is_free_parameter[active_rows, None]
-        normal_matrices = np.einsum("knp,knq->kpq", j, j)
-        gradients = np.einsum("knp,kn->kp", j, r)
+            jacobian = jacobian * is_free_parameter[active_rows, None]
+        normal_matrices = np.einsum("knp,knq->kpq", jacobian, jacobian)
+        gradients = np.einsum("knp,kn->kp", jacobian, r)
         normal_diagonals = (
             np.einsum("kpp->kp", normal_matrices) * damping_factors[active_rows, None]
             + regularisation
@@ -351,7 +351,7 @@ def find_minima(
             parameter_ranges.upper_limits,
         )
         predicted_residual = r + np.einsum(
-            "knp,kp->kn", j, trial_parameters - best_parameters[active_rows]
+            "knp,kp->kn", jacobian, trial_parameters - best_parameters[active_rows]
         )
         predicted_reduction = chi2[active_rows] - np.einsum(
             "kn,kn->k", predicted_residual, predicted_residual

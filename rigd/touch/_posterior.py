@@ -104,11 +104,13 @@ def sample_posterior(
             drawn_chi2[is_in_bounds] = chi2_of(drawn_samples[is_in_bounds])
         proposals.append((centres, covariances, mixture_weights))
         proposal_density = (
-            proposal_density + _density(samples, *proposals[-1])
+            proposal_density + _mixture_density(samples, *proposals[-1])
             if samples.size
             else proposal_density
         )
-        new_proposal_density = sum(_density(drawn_samples, *proposal) for proposal in proposals)
+        new_proposal_density = sum(
+            _mixture_density(drawn_samples, *proposal) for proposal in proposals
+        )
         samples = np.concatenate([samples, drawn_samples])
         chi2 = np.concatenate([chi2, drawn_chi2])
         proposal_density = np.concatenate([proposal_density, new_proposal_density])
@@ -142,7 +144,7 @@ def sample_posterior(
     return posterior
 
 
-def _density(
+def _mixture_density(
     samples: RealArray, centres: RealArray, covariances: RealArray, mixture_weights: RealArray
 ) -> RealArray:
     """Return the density of a mixture of Student distributions at each sample, shape (n,).

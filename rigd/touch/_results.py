@@ -68,7 +68,7 @@ class TouchEstimate:
     """Instants of the contact force, from the record's first sample; shape (k,)."""
 
     @property
-    def explained(self) -> bool:
+    def is_explained(self) -> bool:
         """Whether an obstacle or an impact explains the record up to noise."""
         return self.time_s is not None
 

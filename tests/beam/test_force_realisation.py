@@ -34,7 +34,9 @@ def response(realised, s):
     """Outputs per force, shape (s, outputs)."""
     poles, vectors = np.linalg.eig(realised.a)
     driven = np.linalg.solve(vectors, realised.b.astype(complex))
-    return (driven / (s[:, None] - poles)) @ (realised.rows @ vectors).T + realised.direct
+    return (driven / (s[:, None] - poles)) @ (
+        realised.output_rows @ vectors
+    ).T + realised.feedthrough
 
 
 @pytest.mark.parametrize("highest_rad_s", [further(1e4), 1e5])
@@ -65,7 +67,7 @@ def test_response_to_a_force_is_the_exact_one(damping, at_m, highest_rad_s):
 def test_static_force_bends_the_beam_as_in_textbooks():
     at_m = 0.7
     realised = realise_force(BEAM, DAMPINGS["paper"], at_m, OUTPUT_POSITIONS_M, 1e4)
-    static = realised.direct - realised.rows @ np.linalg.solve(realised.a, realised.b)
+    static = realised.feedthrough - realised.output_rows @ np.linalg.solve(realised.a, realised.b)
     ei = BEAM.bending_stiffness_n_m2
     short, long = np.minimum(OUTPUT_POSITIONS_M, at_m), np.maximum(OUTPUT_POSITIONS_M, at_m)
     assert static[:3] == pytest.approx(short**2 * (3 * long - short) / (6 * ei), rel=2e-3)

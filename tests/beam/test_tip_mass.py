@@ -124,7 +124,7 @@ def test_poles_of_modes_with_own_stiffness_are_realised(compliance):
 
 def test_quantities_undefined_for_own_stiffness_are_refused():
     with pytest.raises(ValueError, match="The shear of modes"):
-        offset(0.0).shear(np.array([1j]))
+        offset(0.0).shear_response(np.array([1j]))
     with pytest.raises(ValueError, match="exclude each other"):
         replace(offset(0.0), tip_mass_kg=1e-4)
 

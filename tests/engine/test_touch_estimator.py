@@ -22,8 +22,8 @@ class RecordingFollower:
     def preview(self, record):
         self.requests.append(("look", record.angle_rad.size - record.detection_index))
 
-    def update(self, record, *, scan, is_first):
-        assert not scan
+    def update(self, record, *, includes_likelihoods, is_first):
+        assert not includes_likelihoods
         after = record.angle_rad.size - record.detection_index
         self.requests.append(("first" if is_first else "last", after))
         return SimpleNamespace(as_dict=lambda start_s: {"start_s": start_s})

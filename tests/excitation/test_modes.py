@@ -163,7 +163,7 @@ def test_split_of_the_time_is_optimal(rig):
         )
         g, gradient = transfer_and_gradient(2j * np.pi * f, tuned, damping, GRADIENT_NAMES)
         rows = np.stack([*gradient, f * g * 2j * np.pi, (2 * np.pi * f) ** 2 + 0j])
-        rows *= rig.tracking(f)
+        rows *= rig.tracking_response(f)
         rates.append((rows.conj() @ rows.T).real / f.size)
     rates = np.array(rates)
     scale = np.sqrt(rates.sum(axis=0).diagonal())

@@ -89,7 +89,7 @@ def test_target_holds_for_all_modes_by_default():
     assert found[-1].std == pytest.approx(7.1e-5 * 0.01)
     assert found[-1].reached
     np.testing.assert_allclose(
-        quantities.std_to_target_ratios(covariance), [each.ratio for each in found]
+        quantities.std_to_target_ratios(covariance), [each.std_to_target_ratio for each in found]
     )
 
 

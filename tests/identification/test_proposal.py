@@ -24,7 +24,7 @@ ESTIMATE = MotorEstimate(
 
 
 def test_verdict_uses_three_deviations(profile):
-    differs = {row.key: row.differs for row in propose(ESTIMATE, profile).rows}
+    differs = {row.profile_key: row.differs for row in propose(ESTIMATE, profile).rows}
     assert differs["motor.inertia_kg_m2"] is True
     assert differs["motor.viscous_nm_s_per_rad"] is False
     assert differs["actuation.delay_s"] is False

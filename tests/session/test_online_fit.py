@@ -44,7 +44,7 @@ def test_lines_state_modes_changes_doubts_and_findings():
     ]
     assert "change" not in "".join(estimate_lines(now))
     assert "tip slope unknown" in estimate_lines(before)[0]
-    assert modes_from_json(now["modes"])[0].line() in estimate_lines(now)[1]
+    assert modes_from_json(now["modes"])[0].summary_line() in estimate_lines(now)[1]
 
 
 def test_lines_state_the_reason_for_no_estimate():

@@ -69,7 +69,7 @@ def test_torque_and_shear_are_those_of_the_exact_response(rig, more):
     seen = np.fft.rfft(angle * decay, 4 * TICKS)
     if "torque_filter_hz" in more:
         seen *= low_pass(s, more["torque_filter_hz"], more.get("torque_filter_order", 1))
-    for sensed, response in ((torque, beam.transfer(s)), (shear, beam.shear(s))):
+    for sensed, response in ((torque, beam.transfer(s)), (shear, beam.shear_response(s))):
         exact = np.fft.irfft(seen * response, 4 * TICKS)[:TICKS]
         difference = (sensed - exact / decay)[: TICKS * 9 // 10]
         assert np.std(difference) < 3e-4 * np.std(sensed)
@@ -94,10 +94,10 @@ def test_shear_accelerates_the_beam_and_its_tip_mass(rig):
         + mass_kg * s**2 * tip
     )
     clamped = Plant(rig.beam, rig.damping, tip_mass_kg=mass_kg)
-    assert clamped.shear(s) == pytest.approx(momentum, rel=1e-9)
+    assert clamped.shear_response(s) == pytest.approx(momentum, rel=1e-9)
     soft = replace(clamped, root_compliance_rad_per_nm=compliance)
     turned = 1 / (1 + compliance * clamped.transfer(s))
-    assert soft.shear(s) == pytest.approx(momentum * turned, rel=1e-9)
+    assert soft.shear_response(s) == pytest.approx(momentum * turned, rel=1e-9)
 
 
 def test_a_slower_clock_delays_the_torque_ever_more(rig):

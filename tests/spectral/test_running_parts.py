@@ -68,8 +68,12 @@ def test_the_newest_samples_reach_back_to_the_last_long_gap(block):
     values = 2.0 * ticks[np.newaxis]
     segments, _ = cut(ticks, values, list(range(block, ticks.size, block)))
     assert segments.end == 150
-    np.testing.assert_allclose(segments.newest(1000)[0], 2.0 * np.arange(120, 150), rtol=1e-14)
-    np.testing.assert_allclose(segments.newest(12)[0], 2.0 * np.arange(138, 150), rtol=1e-14)
+    np.testing.assert_allclose(
+        segments.newest_samples(1000)[0], 2.0 * np.arange(120, 150), rtol=1e-14
+    )
+    np.testing.assert_allclose(
+        segments.newest_samples(12)[0], 2.0 * np.arange(138, 150), rtol=1e-14
+    )
 
 
 def test_only_a_short_initial_gap_is_held():

@@ -33,7 +33,9 @@ def estimate_of(estimator, records_by_name, computed_once):
 @pytest.fixture(scope="module")
 def first_estimate_of(estimator, records_by_name):
     """Function that estimates a record, given by name, from 50 ms after the detection."""
-    return cache(lambda name: estimator.estimate(cut(records_by_name[name], 50), scan=False))
+    return cache(
+        lambda name: estimator.estimate(cut(records_by_name[name], 50), includes_likelihoods=False)
+    )
 
 
 @pytest.mark.parametrize("name", AT_REST)
@@ -106,7 +108,9 @@ EARLY_SAMPLES, LATE_SAMPLES = 4, 6
 )
 def test_no_wrong_position_or_kind(estimator, ambiguous_records, name, noticed):
     """Bounces on yielding, moving or two obstacles also fit one at rest at another position."""
-    estimate = estimator.estimate(cut(ambiguous_records[name], 190, noticed=noticed), scan=False)
+    estimate = estimator.estimate(
+        cut(ambiguous_records[name], 190, noticed=noticed), includes_likelihoods=False
+    )
     kind = {"gives": "yielding", "flees": "moving", "two": "unknown"}[name.split()[0]]
     assert estimate.kind in (kind, "unknown")
     obstacles, _ = MISTAKEN[name]
@@ -129,9 +133,9 @@ def test_two_soft_obstacles_are_not_reported_as_one(estimator, ambiguous_records
     """One obstacle at 0.11 m explains the first 50 ms up to noise."""
     (first, second), _ = ALIKE["two alike"]
     record = ambiguous_records["two alike"]
-    early = estimator.estimate(cut(record, 50), scan=False)
+    early = estimator.estimate(cut(record, 50), includes_likelihoods=False)
     assert abs(early.x_m.value - first.x_m) < 4 * early.x_m.std
-    estimate = estimator.estimate(cut(record, 190), scan=False)
+    estimate = estimator.estimate(cut(record, 190), includes_likelihoods=False)
     assert estimate.kind == "unknown"
     assert estimate.chi2_per_degree < 1.3
     low, high = estimate.x_m.interval_95
@@ -146,7 +150,9 @@ def test_first_interval_includes_pairs_of_obstacles(estimator):
     """With this noise two obstacles explain the first 50 ms only a little better than one."""
     (first, second), slew = ALIKE["two alike"]
     [record] = simulate([(first, second)], [slew], duration_s=0.62, steps=20, modes=20, seed=7)
-    estimate = estimator.growing_estimator().update(cut(record, 50), scan=False, is_first=True)
+    estimate = estimator.growing_estimator().update(
+        cut(record, 50), includes_likelihoods=False, is_first=True
+    )
     low, high = estimate.x_m.interval_95
     assert low < first.x_m < high < second.x_m
     assert abs(estimate.x_m.value - first.x_m) < 4 * estimate.x_m.std
@@ -154,7 +160,9 @@ def test_first_interval_includes_pairs_of_obstacles(estimator):
 
 @pytest.mark.parametrize("after", [further(50), 190])
 def test_one_obstacle_is_not_reported_as_two(estimator, ambiguous_records, after):
-    estimate = estimator.estimate(cut(ambiguous_records["one alike"], after), scan=False)
+    estimate = estimator.estimate(
+        cut(ambiguous_records["one alike"], after), includes_likelihoods=False
+    )
     obstacle, _ = ALIKE["one alike"]
     assert estimate.kind == "rigid"
     assert abs(estimate.x_m.value - obstacle.x_m) < 4 * estimate.x_m.std
@@ -168,8 +176,12 @@ def growing_estimates(estimator, simulated, *, noticed=NOTICED):
     """Return first and last estimate, updated as in the process of the touch estimator."""
     growing_estimate = estimator.growing_estimator()
     growing_estimate.preview(cut(simulated, 25, noticed=noticed))
-    first = growing_estimate.update(cut(simulated, 50, noticed=noticed), scan=False, is_first=True)
-    return first, growing_estimate.update(cut(simulated, 190, noticed=noticed), scan=False)
+    first = growing_estimate.update(
+        cut(simulated, 50, noticed=noticed), includes_likelihoods=False, is_first=True
+    )
+    return first, growing_estimate.update(
+        cut(simulated, 190, noticed=noticed), includes_likelihoods=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +192,9 @@ def estimates_of(estimator, records_by_name):
 
 @pytest.mark.parametrize("name", [*map(further, ("soft", "middle", "fleeing", "knock")), "hard"])
 def test_updated_estimate_equals_single_estimate(estimator, records_by_name, estimates_of, name):
-    single_estimate = estimator.estimate(cut(records_by_name[name], 190), scan=False)
+    single_estimate = estimator.estimate(
+        cut(records_by_name[name], 190), includes_likelihoods=False
+    )
     _, last = estimates_of(name)
     assert (last.kind, last.samples) == (single_estimate.kind, single_estimate.samples)
     assert abs(last.x_m.value - single_estimate.x_m.value) < 0.5 * single_estimate.x_m.std
@@ -210,7 +224,7 @@ def test_first_estimate_of_other_kinds_is_unknown(estimates_of, name):
 def test_update_with_record_that_does_not_grow(estimator, records_by_name):
     growing_estimate = estimator.growing_estimator()
     estimates = [
-        growing_estimate.update(cut(records_by_name["middle"], after), scan=False)
+        growing_estimate.update(cut(records_by_name["middle"], after), includes_likelihoods=False)
         for after in (50, 50, 200)
     ]
     assert [estimate.samples for estimate in estimates] == [50, 50, 100]
@@ -222,7 +236,7 @@ def test_first_estimate_of_stiff_obstacle_near_tip(estimator):
     """Its contacts are the shortest; with steps of 0.1 ms the minimum is missed."""
     obstacle = Obstacle(x_m=0.93, stiffness_n_per_m=1e5)
     [record] = simulate([obstacle], [Slew(1.0)], duration_s=0.8, steps=20, modes=20, seed=4)
-    estimate = estimator.estimate(cut(record, 50), scan=False)
+    estimate = estimator.estimate(cut(record, 50), includes_likelihoods=False)
     assert estimate.kind == "rigid"
     assert abs(estimate.x_m.value - obstacle.x_m) < 4 * estimate.x_m.std
 
@@ -242,7 +256,7 @@ def test_touch_detected_after_90_ms(estimator, records_by_name):
     """The longest assumed time from touch to detection is 120 ms."""
     noticed = 90
     record = cut(records_by_name["middle"], 50, noticed=noticed)
-    estimate = estimator.estimate(record, scan=False)
+    estimate = estimator.estimate(record, includes_likelihoods=False)
     touch_s = estimate.time_s.value + begin_s(records_by_name["middle"], noticed)
     assert estimate.kind == "rigid"
     assert abs(estimate.x_m.value - OBSTACLES["middle"].x_m) < 4 * estimate.x_m.std
@@ -250,7 +264,7 @@ def test_touch_detected_after_90_ms(estimator, records_by_name):
 
 
 def test_estimate_is_reproducible(estimator, first_estimate_of, records_by_name):
-    repeated = estimator.estimate(cut(records_by_name["middle"], 50), scan=False)
+    repeated = estimator.estimate(cut(records_by_name["middle"], 50), includes_likelihoods=False)
     assert repeated.as_dict() == first_estimate_of("middle").as_dict()
 
 

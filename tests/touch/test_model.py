@@ -67,7 +67,7 @@ def test_defaults_for_missing_parameters(write_document):
 
 
 def test_only_one_parameter_changes():
-    model = TouchModel.assumed(STATED)
+    model = TouchModel.with_assumed_uncertainty(STATED)
     stiffer = model.with_changed_parameter("bending_stiffness_n_m2", 0.009)
     assert stiffer.plant.beam.bending_stiffness_n_m2 == pytest.approx(0.099)
     assert stiffer.plant.beam.density_over_stiffness == pytest.approx(
