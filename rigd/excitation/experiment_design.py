@@ -217,7 +217,7 @@ def geometry_floors(
     tolerant_estimate = estimate.with_tolerance(uniformity)
     least_stds = [
         least_standard_deviations(
-            np.zeros((len(beam_estimate.names), len(beam_estimate.names))),
+            np.zeros((len(beam_estimate.free_parameters), len(beam_estimate.free_parameters))),
             beam_estimate,
             Quantities.from_targets(targets, beam_estimate),
             segment_search.line_hz,

@@ -279,7 +279,7 @@ def test_estimate_does_not_depend_on_blocks(data):
     if one is not None:
         np.testing.assert_array_equal(one.response.response, other.response.response)
         np.testing.assert_array_equal(one.is_excited, other.is_excited)
-        assert (one.final, one.response.segments) == (other.final, other.response.segments)
+        assert (one.is_final, one.response.segments) == (other.is_final, other.response.segments)
         assert (one.response.coherence is None) == (other.response.coherence is None)
 
 
