@@ -139,7 +139,7 @@ def model_near(rng: np.random.Generator, *, exact: bool) -> TouchModel:
         "gamma": DAMPED.gamma,
     }
     std = {name: fraction * values[name] for name, fraction in RELATIVE_STD.items()}
-    model = replace(model, std=std)
+    model = replace(model, std_by_parameter=std)
     for name, deviation in std.items():
         model = model.with_changed_parameter(name, deviation * rng.standard_normal())
     return model

@@ -77,7 +77,7 @@ class TouchMonitor:
             cycle.angle_rad,
             cycle.coupling_torque_nm,
             shear_n,
-            missed=missed_ticks,
+            missed_tick_count=missed_ticks,
             angle_stale=bool(status_flags & _ANGLE_STALE),
             wrench_stale=bool(status_flags & _WRENCH_STALE),
         )

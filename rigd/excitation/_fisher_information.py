@@ -101,7 +101,7 @@ class TorqueModel:
             ticks_per_point,
             transform,
             whitened_kernels(estimate, transform.s, transform.rate_hz),
-            np.stack(responses(estimate, transform.s)[1:]),
+            np.stack(plant_responses(estimate, transform.s)[1:]),
         )
 
     @property
@@ -138,7 +138,7 @@ class TorqueModel:
         )
 
 
-def responses(
+def plant_responses(
     estimate: BeamEstimate, s: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """Return the transfer functions from the motor's angle to torques and to the slope of the tip.

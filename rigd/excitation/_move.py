@@ -88,11 +88,12 @@ def move(
     target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
     require_within_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
     rig_plant = rig.move_plant(path, MOVE_USE)
-    farthest_allowed_rad = _MAX_END_ANGLE_FRACTION * rig_plant.angle_rad
+    farthest_allowed_rad = _MAX_END_ANGLE_FRACTION * rig_plant.max_angle_rad
     if not abs(target_rad) <= farthest_allowed_rad:
         raise ExcitationError(
             f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
-            f"{rig_plant.angle_rad:g} rad allows {farthest_allowed_rad:.4g} rad from the zero to "
+            f"{rig_plant.max_angle_rad:g} rad allows {farthest_allowed_rad:.4g} rad from the "
+            "zero to "
             "either side; choose at most "
             f"that{'' if by_rad is None else _allowed_range(farthest_allowed_rad, start_rad)}."
         )

@@ -140,11 +140,11 @@ class SegmentSearch:
             * limit_fraction
             * np.array(
                 [
-                    max(plant.angle_rad - abs(start_rad), 1e-6),
-                    plant.velocity_rad_s,
-                    plant.tracking_error_rad,
+                    max(plant.max_angle_rad - abs(start_rad), 1e-6),
+                    plant.max_velocity_rad_s,
+                    plant.max_tracking_error_rad,
                     plant.peak_torque_nm - plant.friction_nm,
-                    plant.coupling_torque_nm,
+                    plant.max_coupling_torque_nm,
                     tip_slope_rad,
                 ]
             )

@@ -101,15 +101,15 @@ class MovePlant:
     """Largest torque of the motor in N·m."""
     friction_nm: float
     """Torque in N·m against friction, which adds to the torque of the linear response."""
-    largest_acceleration_rad_s2: float
+    max_acceleration_rad_s2: float
     """Upper bound of the reference's acceleration, including the effect of the loop's filters."""
-    velocity_rad_s: float
+    max_velocity_rad_s: float
     """Limit of the speed."""
-    tracking_error_rad: float
+    max_tracking_error_rad: float
     """Limit of the tracking error, reference minus angle."""
-    coupling_torque_nm: float
+    max_coupling_torque_nm: float
     """Range of the sensor's coupling torque in N·m."""
-    angle_rad: float
+    max_angle_rad: float
     """Limit of the angle from the rig's zero, to either side."""
     model: IdentifiedBeam | None = None
     """Beam of an analysis; None: the beam of the profile, or an estimate."""
@@ -232,9 +232,10 @@ class _MoveSearch:
             "torque": MAX_PLANNED_LIMIT_FRACTION * plant.peak_torque_nm
             - plant.friction_nm
             - ringing_torque_nm,
-            "velocity": MAX_PLANNED_LIMIT_FRACTION * plant.velocity_rad_s,
-            "tracking": MAX_PLANNED_LIMIT_FRACTION * plant.tracking_error_rad,
-            "coupling": MAX_PLANNED_LIMIT_FRACTION * plant.coupling_torque_nm - ringing_torque_nm,
+            "velocity": MAX_PLANNED_LIMIT_FRACTION * plant.max_velocity_rad_s,
+            "tracking": MAX_PLANNED_LIMIT_FRACTION * plant.max_tracking_error_rad,
+            "coupling": MAX_PLANNED_LIMIT_FRACTION * plant.max_coupling_torque_nm
+            - ringing_torque_nm,
         }
         if min(self._limits.values()) <= 0.0:
             raise ExcitationError(
@@ -306,7 +307,7 @@ class _MoveSearch:
         interval_ticks = max(1, round(_MIN_ACCELERATION_INTERVAL_S * rate_hz))
         interval_count = min(ceil(move_ticks / interval_ticks), _MAX_ACCELERATION_INTERVALS)
         edge_ticks = np.round(np.linspace(0, move_ticks, interval_count + 1)).astype(int)
-        acceleration_scale = plant.largest_acceleration_rad_s2
+        acceleration_scale = plant.max_acceleration_rad_s2
 
         vibration_map = residual_vibration_map(
             move_ticks, rate_hz, plant.poles_rad_s, self._order_of_zeros
@@ -437,7 +438,10 @@ class _MoveSearch:
         angle_map = acceleration_scale * _interval_responses(
             unit_responses["angle"], edge_ticks, every_second_tick
         )
-        angle_margins_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
+        angle_margins_rad = (
+            plant.max_angle_rad - self._start_rad,
+            plant.max_angle_rad + self._start_rad,
+        )
         return (
             np.concatenate(limited_rows),
             np.vstack([angle_map, -angle_map]),
@@ -454,11 +458,11 @@ class _MoveSearch:
         loop_response = plant.respond(extended_reference_rad)
         peak_fractions = (
             (np.abs(loop_response.torque_nm).max() + plant.friction_nm) / plant.peak_torque_nm,
-            np.abs(loop_response.velocity_rad_s).max() / plant.velocity_rad_s,
+            np.abs(loop_response.velocity_rad_s).max() / plant.max_velocity_rad_s,
             np.abs(extended_reference_rad - loop_response.angle_rad).max()
-            / plant.tracking_error_rad,
-            np.abs(loop_response.coupling_torque_nm).max() / plant.coupling_torque_nm,
-            np.abs(self._start_rad + loop_response.angle_rad).max() / plant.angle_rad,
+            / plant.max_tracking_error_rad,
+            np.abs(loop_response.coupling_torque_nm).max() / plant.max_coupling_torque_nm,
+            np.abs(self._start_rad + loop_response.angle_rad).max() / plant.max_angle_rad,
         )
         return float(max(peak_fractions))
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rigd.beam import Pole
 from rigd.excitation._beam_estimate import BAND_HZ, BeamEstimate
-from rigd.excitation._fisher_information import covariance_of, responses, whitened_kernels
+from rigd.excitation._fisher_information import covariance_of, plant_responses, whitened_kernels
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._sweeps import SIDE_BAND_OFFSET
 from rigd.excitation.moves import quintic
@@ -53,7 +53,7 @@ def steady_sines(
     )
     frequency_hz = frequency_hz[(frequency_hz > 0.0) & (frequency_hz < BAND_HZ)]
     s = 2j * pi * frequency_hz
-    _, torque_response, slope_response = responses(estimate, s)
+    _, torque_response, slope_response = plant_responses(estimate, s)
     # The response to a short pulse gives the torque for the motor's own inertia, and its lag.
     pulse_reference_rad = np.zeros(round(plant.rate_hz))
     pulse_rise = quintic(0.01, plant.rate_hz)

@@ -106,13 +106,13 @@ def move_plant_of(
         settling_s=_SETTLING_TIME_CONSTANTS / uncompensated_settings.pole_rad_s,
         peak_torque_nm=control_motor.peak_torque_nm,
         friction_nm=profile.control.friction_compensation_nm,
-        largest_acceleration_rad_s2=_MAX_REFERENCE_ACCELERATION_RATIO
+        max_acceleration_rad_s2=_MAX_REFERENCE_ACCELERATION_RATIO
         * control_motor.peak_torque_nm
         / control_motor.inertia_kg_m2,
-        velocity_rad_s=profile.limits.velocity_rad_s,
-        tracking_error_rad=profile.limits.tracking_error_rad,
-        coupling_torque_nm=coupling_limit_nm,
-        angle_rad=profile.limits.angle_rad,
+        max_velocity_rad_s=profile.limits.velocity_rad_s,
+        max_tracking_error_rad=profile.limits.tracking_error_rad,
+        max_coupling_torque_nm=coupling_limit_nm,
+        max_angle_rad=profile.limits.angle_rad,
         model=identified_beam,
     )
 

@@ -179,7 +179,7 @@ class TouchDetector:
         torque_nm: float,
         shear_n: float,
         *,
-        missed: int = 0,
+        missed_tick_count: int = 0,
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> bool:
@@ -187,7 +187,7 @@ class TouchDetector:
 
         Parameters
         ----------
-        angle_rad, torque_nm, shear_n, missed, angle_stale, wrench_stale
+        angle_rad, torque_nm, shear_n, missed_tick_count, angle_stale, wrench_stale
             See `InnovationFilter.step`.
         """
         innovation_filter = self._filter
@@ -195,7 +195,7 @@ class TouchDetector:
             angle_rad,
             torque_nm,
             shear_n,
-            missed=missed,
+            missed_tick_count=missed_tick_count,
             angle_stale=angle_stale,
             wrench_stale=wrench_stale,
         )

@@ -226,7 +226,7 @@ class InnovationFilter:
         torque_nm: float,
         shear_n: float,
         *,
-        missed: int = 0,
+        missed_tick_count: int = 0,
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> None:
@@ -236,7 +236,7 @@ class InnovationFilter:
         ----------
         angle_rad, torque_nm, shear_n
             Measured angle, torque and base shear; the shear is ignored if the model has none.
-        missed
+        missed_tick_count
             Number of ticks that were missed before this tick; their angles are interpolated.
         angle_stale
             Whether the angle is older than the tick; it is then extrapolated from earlier angles.
@@ -248,10 +248,10 @@ class InnovationFilter:
         relative_angle_rad = angle_rad - self._start_rad
         if angle_stale:
             relative_angle_rad = 2.0 * self._angle_rad - self._previous_angle_rad
-        if missed:
+        if missed_tick_count:
             start_rad = self._angle_rad
-            for missed_tick in range(1, missed + 1):
-                path_fraction = missed_tick / (missed + 1)
+            for missed_tick in range(1, missed_tick_count + 1):
+                path_fraction = missed_tick / (missed_tick_count + 1)
                 self._step_without_wrench(
                     start_rad + path_fraction * (relative_angle_rad - start_rad), torque_nm, shear_n
                 )

@@ -36,7 +36,7 @@ class TouchModel:
     """Filters of torque and shear."""
     source: str = "profile"
     """Origin of the model, as shown to the operator: ``profile`` or the path of a document."""
-    std: Mapping[str, float] = field(default_factory=dict)
+    std_by_parameter: Mapping[str, float] = field(default_factory=dict)
     """Standard deviation of each uncertain parameter in its unit, by name. The mass per length is
     no parameter, but the product of bending stiffness and density over stiffness."""
 
@@ -89,7 +89,7 @@ class TouchModel:
             plant,
             angle_delay_s,
             sensor_filter,
-            std={
+            std_by_parameter={
                 parameter_name: relative_std * parameter_values[parameter_name]
                 for parameter_name, relative_std in _ASSUMED_RELATIVE_STDS.items()
             },
@@ -127,5 +127,5 @@ class TouchModel:
             angle_delay_s,
             sensor_filter,
             source=str(path),
-            std=identified_beam.parameter_stds,
+            std_by_parameter=identified_beam.parameter_stds,
         )

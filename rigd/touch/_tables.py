@@ -69,7 +69,7 @@ class TouchTables:
                 rate_hz,
                 self.max_samples,
             )
-            for parameter_name, std in model.std.items()
+            for parameter_name, std in model.std_by_parameter.items()
             if std > 0
         ]
         """Free beams in each of which one uncertain parameter is one standard deviation larger."""

@@ -48,9 +48,9 @@ class ScriptedDetector:
         self.armed = False
         self.disarmed_at.append(self.tick)
 
-    def step(self, angle_rad, torque_nm, shear_n, *, missed, angle_stale, wrench_stale):
-        self.seen = angle_rad, torque_nm, shear_n, missed, angle_stale, wrench_stale
-        self.tick += 1 + missed
+    def step(self, angle_rad, torque_nm, shear_n, *, missed_tick_count, angle_stale, wrench_stale):
+        self.seen = angle_rad, torque_nm, shear_n, missed_tick_count, angle_stale, wrench_stale
+        self.tick += 1 + missed_tick_count
         return self.armed and self.tick in self.at
 
     def contact_force_n(self, shear_n):

@@ -149,10 +149,10 @@ def test_move_removes_initial_vibration(plant, ring_down_nm, robust):
 @pytest.mark.parametrize(
     ("name", "limit"),
     [
-        ("velocity_rad_s", 1.5),
+        ("max_velocity_rad_s", 1.5),
         further("peak_torque_nm", 0.15),  # which the shortest move above is near to
-        ("coupling_torque_nm", 0.025),
-        ("tracking_error_rad", 0.03),
+        ("max_coupling_torque_nm", 0.025),
+        ("max_tracking_error_rad", 0.03),
     ],
 )
 def test_moves_slow_down_for_the_limits(plant, plain, name, limit):
@@ -162,13 +162,13 @@ def test_moves_slow_down_for_the_limits(plant, plain, name, limit):
 
 
 def test_a_move_stays_within_the_angle(plant, monkeypatch):
-    tight = replace(plant, angle_rad=1.0)
+    tight = replace(plant, max_angle_rad=1.0)
     move = shortest_move(tight, 0.97)
     response = tight.respond(np.concatenate([[0.0], move.reference_rad, np.full(200, 0.97)]))
     assert response.angle_rad.max() <= 1.001
     monkeypatch.setattr("rigd.excitation._shortest_move.LONGEST_MOVE_S", 2.0)
     with pytest.raises(ExcitationError, match=r"limits\.velocity_rad_s"):
-        shortest_move(replace(plant, velocity_rad_s=0.1), 1.0)
+        shortest_move(replace(plant, max_velocity_rad_s=0.1), 1.0)
 
 
 def test_slew_has_its_speed_without_vibration(plant, ring_down_nm):

@@ -43,7 +43,7 @@ def model():
     """Model of the simulated beam, with small uncertainties of its parameters."""
     return TouchModel(
         Plant(LINK, DAMPED),
-        std={
+        std_by_parameter={
             "bending_stiffness_n_m2": 5e-4 * LINK.bending_stiffness_n_m2,
             "density_over_stiffness": 2e-4 * LINK.density_over_stiffness,
             "zeta": 0.05 * DAMPED.zeta,

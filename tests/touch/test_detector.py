@@ -276,7 +276,12 @@ def test_no_detection_with_missed_ticks_and_stale_readings(model):
         angle = last_readings[0] if stale_angle else tick_readings[0]
         torque, shear = last_readings[1:] if stale_wrench else tick_readings[1:]
         is_detected = detector.step(
-            angle, torque, shear, missed=missed, angle_stale=stale_angle, wrench_stale=stale_wrench
+            angle,
+            torque,
+            shear,
+            missed_tick_count=missed,
+            angle_stale=stale_angle,
+            wrench_stale=stale_wrench,
         )
         assert not is_detected
         missed, last_readings = 0, tick_readings

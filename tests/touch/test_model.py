@@ -48,10 +48,10 @@ def test_model_from_analysis(write_document):
     assert model.plant.tool_inertia_kg_m2 == 1e-5
     assert model.wrench_delay_s == pytest.approx(3e-4)  # older than the angle, by delay_s
     assert model.source == str(path)
-    assert model.std["bending_stiffness_n_m2"] == pytest.approx(4e-4 / 3.919928)
-    assert model.std["alpha"] == 0.01
-    assert "lambda" not in model.std
-    assert "tool_inertia_kg_m2" not in model.std
+    assert model.std_by_parameter["bending_stiffness_n_m2"] == pytest.approx(4e-4 / 3.919928)
+    assert model.std_by_parameter["alpha"] == 0.01
+    assert "lambda" not in model.std_by_parameter
+    assert "tool_inertia_kg_m2" not in model.std_by_parameter
 
 
 def test_defaults_for_missing_parameters(write_document):
@@ -81,6 +81,11 @@ def test_only_one_parameter_changes():
     assert model.with_changed_parameter("zeta", -1.0).plant.damping.zeta == 0.0
     assert model.with_changed_parameter("alpha", 0.2).plant.damping.alpha == pytest.approx(1.2)
     assert model.with_changed_parameter("delay_s", 1e-4).wrench_delay_s == pytest.approx(1e-4)
-    assert set(model.std) == {"bending_stiffness_n_m2", "density_over_stiffness", "zeta", "gamma"}
+    assert set(model.std_by_parameter) == {
+        "bending_stiffness_n_m2",
+        "density_over_stiffness",
+        "zeta",
+        "gamma",
+    }
     with pytest.raises(ValueError, match="is not a parameter"):
         model.with_changed_parameter("length", 0.1)
