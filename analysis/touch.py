@@ -496,7 +496,7 @@ def _detect_touches(
             is_armed = True
         if detector.step(
             angle_rad, sample_torque_nm, sample_shear_n,
-            missed=tick - previous_tick - 1,
+            missed_tick_count=tick - previous_tick - 1,
             angle_stale=is_angle_stale, wrench_stale=is_wrench_stale,
         ):  # fmt: skip
             if tick - last_detection_tick > pause_ticks:
