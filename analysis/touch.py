@@ -216,7 +216,8 @@ class TouchAnalysis:
         warnings = []
         if shear_coefficients is None:
             warnings.append(
-                "The file states no shear_projection: the touches are estimated from the torque alone, which determines instant and point poorly."
+                "The file states no shear_projection: the touches are estimated from the torque "
+                "alone, which determines instant and point poorly."
             )
         flagged_ticks = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
         contact_ticks = round(MAX_CONTACT_S * rate_hz)
@@ -236,7 +237,8 @@ class TouchAnalysis:
             )
             if len(detected_ticks) > _MAX_TOUCHES:
                 warnings.append(
-                    f"More than {_MAX_TOUCHES} touches were found, of which the first are shown: the model does not fit the record. Use an identified one (--model)."
+                    f"More than {_MAX_TOUCHES} touches were found, of which the first are shown: "
+                    "the model does not fit the record. Use an identified one (--model)."
                 )
                 detected_ticks = detected_ticks[:_MAX_TOUCHES]
         touches = []
@@ -372,7 +374,9 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     """
     if tip_mass_kg := stated_tip_mass_kg(session):
         raise RecordError(
-            f"{session.path}: tip_mass_kg = {tip_mass_kg:.4g} kg: the estimation of touches does not take a mass at the tip into account; take it off, remove beam.tip_mass_kg from the profile, and record again."
+            f"{session.path}: tip_mass_kg = {tip_mass_kg:.4g} kg: the estimation of touches does "
+            "not take a mass at the tip into account; take it off, remove beam.tip_mass_kg from "
+            "the profile, and record again."
         )
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
@@ -392,7 +396,8 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     damping: Damping | None = next(filter(None, map(nominal_damping, attached_files)), None)
     if damping is None:
         raise SessionError(
-            f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
+            f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is "
+            "not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
     return TouchModel.with_assumed_uncertainty(
         replace(undamped_plant, damping=damping), angle_delay_s, sensor_filter
@@ -417,7 +422,9 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
     delay_fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(filter_kind, inf)
     if not 0.0 <= delay_fraction < _MAX_SENSOR_FILTER_TICKS:
         raise RecordError(
-            f"{session.path}: sensor_filter is {filter_kind[:100]!r} with sensor_filter_delay_s = {delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) or a triangle (shorter than a period); correct the file's metadata."
+            f"{session.path}: sensor_filter is {filter_kind[:100]!r} with sensor_filter_delay_s "
+            f"= {delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} "
+            "s) or a triangle (shorter than a period); correct the file's metadata."
         )
     averaged_record_count = round(1 / (1 - delay_fraction))
     record_spacing_s = delay_fraction / rate_hz / max(averaged_record_count - 1, 1)
@@ -441,7 +448,8 @@ def _shear_projection(session: Session) -> tuple[float, ...] | None:
         coefficients = ()
     if len(coefficients) != 6 or not np.isfinite(coefficients).all():
         raise RecordError(
-            f"{session.path}: shear_projection is {projection_text[:100]!r}, but must be six numbers for fx, fy, fz, tx, ty, tz; correct the file's metadata."
+            f"{session.path}: shear_projection is {projection_text[:100]!r}, but must be six "
+            "numbers for fx, fy, fz, tx, ty, tz; correct the file's metadata."
         )
     return coefficients if any(coefficients) else None
 
@@ -530,7 +538,9 @@ def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     touches_without_estimate = [touch.number for touch in touches if touch.estimate is None]
     if touches_without_estimate:
         sentences.append(
-            f"Touch {_number_list(touches_without_estimate)}: not estimated, because that requires {_MIN_RECORD_BEFORE_TOUCH_S:g} s of record before a touch and {1e3 * _MIN_RECORD_AFTER_TOUCH_S:g} ms after it."
+            f"Touch {_number_list(touches_without_estimate)}: not estimated, because that "
+            f"requires {_MIN_RECORD_BEFORE_TOUCH_S:g} s of record before a touch and "
+            f"{1e3 * _MIN_RECORD_AFTER_TOUCH_S:g} ms after it."
         )
     unexplained_touches = [
         touch.number
@@ -539,7 +549,10 @@ def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
     ]
     if unexplained_touches:
         sentences.append(
-            f"Touch {_number_list(unexplained_touches)}: the record is not explained by the model (residuals more than {sqrt(_LARGEST_CHI2_PER_DEGREE):.1f} times the noise). Use an identified model (--model); if there was no contact, such a touch is an error of the model."
+            f"Touch {_number_list(unexplained_touches)}: the record is not explained by the "
+            f"model (residuals more than {sqrt(_LARGEST_CHI2_PER_DEGREE):.1f} times the noise). "
+            "Use an identified model (--model); if there was no contact, such a touch is an "
+            "error of the model."
         )
     return sentences
 

@@ -244,7 +244,10 @@ class ReportedMode:
         >>> print(ReportedMode(1, frequency_hz, Estimate(0.00909, None, None)).summary_line())
         mode 1: 2.5699 ± 0.0012 Hz, damping 0.909 %
         """
-        mode_text = f"mode {self.number}: {self.frequency_hz.text()} Hz, damping {self.damping_ratio.text(100.0)} %"
+        mode_text = (
+            f"mode {self.number}: {self.frequency_hz.text()} Hz, damping "
+            f"{self.damping_ratio.text(100.0)} %"
+        )
         if self.participation is None:
             return mode_text
         return f"{mode_text}, inertia {self.participation.text(_KG_MM2_PER_KG_M2)} kg·mm²"

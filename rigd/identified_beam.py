@@ -34,7 +34,8 @@ _WRITE_DOCUMENT_ADVICE: Final = "write it with analyze session.mcap --json model
 
 
 _FILTER_ADVICE: Final = (  # Advice if the analysis found a low-pass filter
-    "state it in the profile (sensor.filter_hz = {corner_hz:.4g}, sensor.filter_order = {order}), record again and analyze that session"
+    "state it in the profile (sensor.filter_hz = {corner_hz:.4g}, sensor.filter_order = "
+    "{order}), record again and analyze that session"
 )
 _EFFECTS_BY_PARAMETER: Final[Mapping[str, tuple[str, str]]] = {
     "tip_mass_kg": ("a mass at the tip", "take it off, and record and analyze again"),
@@ -175,7 +176,9 @@ def read_identified_beam(
     headline_label, headline, refusal = _read_headline(Path(document_path))
     if refusal and not use.allows_observed_modes:
         raise IdentifiedBeamError(
-            f"{headline_label}.validity.uniform_beam: {refusal}, and {use.name} relies on a uniform beam; remove what makes it differ (a mass, a soft clamp, an axis that is not plumb), and record and analyze again, or leave out --model."
+            f"{headline_label}.validity.uniform_beam: {refusal}, and {use.name} relies on a "
+            "uniform beam; remove what makes it differ (a mass, a soft clamp, an axis that is "
+            "not plumb), and record and analyze again, or leave out --model."
         )
     _require_known_findings(headline_label, headline.get("named"), use)
     exact_geometry = headline.get("exact_geometry")
@@ -239,7 +242,9 @@ def _with_observed_modes(
         observed_modes.append(mode)
     if not observed_modes:
         raise IdentifiedBeamError(
-            f"{headline_label}.modes: {refusal}, and no mode is shown without a flag that could take its place; record a session that shows more modes and analyze it, or leave out --model."
+            f"{headline_label}.modes: {refusal}, and no mode is shown without a flag that could "
+            "take its place; record a session that shows more modes and analyze it, or leave "
+            "out --model."
         )
     try:
         plant = identified_beam.plant.with_frequencies(
@@ -366,7 +371,9 @@ def uniform_beam_test(headline_label: str, headline: Mapping[str, Any]) -> BeamU
     uniformity_test = BeamUniformity.from_document(stated_test)
     if uniformity_test is None:
         raise IdentifiedBeamError(
-            f"{headline_label}: validity.uniform_beam = {json.dumps(stated_test, default=str)[:60]} of a headline is not the result of a test; {_WRITE_DOCUMENT_ADVICE}."
+            f"{headline_label}: validity.uniform_beam = "
+            f"{json.dumps(stated_test, default=str)[:60]} of a headline is not the result of a "
+            f"test; {_WRITE_DOCUMENT_ADVICE}."
         )
     return uniformity_test
 
@@ -376,7 +383,10 @@ def _uniform_beam_refusal(path: Path, headline: Mapping[str, Any]) -> str:
     uniformity_test = uniform_beam_test(str(path), headline)
     if uniformity_test.status != "refused":
         return ""
-    return f"a uniform beam does not predict the modes that the record shows (p = {uniformity_test.p_value:.1g})"
+    return (
+        "a uniform beam does not predict the modes that the record shows (p = "
+        f"{uniformity_test.p_value:.1g})"
+    )
 
 
 def parameter_estimates(headline_label: str, parameter_documents: object) -> dict[str, Estimate]:
@@ -405,7 +415,8 @@ def parameter_estimates(headline_label: str, parameter_documents: object) -> dic
     for name in BEAM_PARAMETERS:
         if name not in estimates:
             raise IdentifiedBeamError(
-                f"{headline_label}.parameters.{name} is missing; take the document of an analysis that found it (analyze session.mcap --json model.json)."
+                f"{headline_label}.parameters.{name} is missing; take the document of an "
+                "analysis that found it (analyze session.mcap --json model.json)."
             )
     return estimates
 
@@ -446,7 +457,9 @@ def _parameter_estimate(
         parameter_definition = parameter_named(parameter_name)
     except KeyError:
         raise IdentifiedBeamError(
-            f"{headline_label}.parameters.{parameter_name[:60]!r} is not known to this version, so what it changes cannot be taken into account; update rigd, or do without this document."
+            f"{headline_label}.parameters.{parameter_name[:60]!r} is not known to this version, "
+            "so what it changes cannot be taken into account; update rigd, or do without this "
+            "document."
         ) from None
     estimate = Estimate.from_json(parameter_document)
     if (
@@ -457,7 +470,9 @@ def _parameter_estimate(
         return estimate
     stated_value = parameter_document.get("value") if isinstance(parameter_document, dict) else None
     raise IdentifiedBeamError(
-        f"{headline_label}.parameters.{parameter_name}.value = {json.dumps(stated_value, default=str)[:60]} must be a number of {parameter_definition.range_text}; {_WRITE_DOCUMENT_ADVICE}."
+        f"{headline_label}.parameters.{parameter_name}.value = "
+        f"{json.dumps(stated_value, default=str)[:60]} must be a number of "
+        f"{parameter_definition.range_text}; {_WRITE_DOCUMENT_ADVICE}."
     )
 
 
@@ -481,13 +496,16 @@ def _require_known_effects(
         unit = parameter_named(parameter_name).unit
         unit_text = f" {unit}" if unit else ""
         raise IdentifiedBeamError(
-            f"{headline_label}.parameters.{parameter_name}.value = {parameter_value:.4g}{unit_text}: the analysis found {description}, which {use.name} does not take into account; {remedy_text}."
+            f"{headline_label}.parameters.{parameter_name}.value = "
+            f"{parameter_value:.4g}{unit_text}: the analysis found {description}, which "
+            f"{use.name} does not take into account; {remedy_text}."
         )
     if values_by_name.get("tip_mass_kg") and any(
         values_by_name[n] for n in values_by_name if n.startswith(OFFSET_PREFIX)
     ):
         raise IdentifiedBeamError(
-            f"{headline_label}.parameters: tip_mass_kg and {OFFSET_PREFIX}… together are not defined; use the JSON of an analysis that found one of them."
+            f"{headline_label}.parameters: tip_mass_kg and {OFFSET_PREFIX}… together are not "
+            "defined; use the JSON of an analysis that found one of them."
         )
 
 
@@ -495,7 +513,9 @@ def _require_known_findings(headline_label: str, named_findings: object, use: Be
     """Raise IdentifiedBeamError if no parameter describes a finding of the analysis."""
     for finding_index, finding_kind, sentence in findings_without_parameter(named_findings):
         raise IdentifiedBeamError(
-            f"{headline_label}.named[{finding_index}]: {finding_kind}, which {use.name} does not take into account ({sentence}); remove its cause, and record and analyze again, or leave out --model."
+            f"{headline_label}.named[{finding_index}]: {finding_kind}, which {use.name} does not "
+            f"take into account ({sentence}); remove its cause, and record and analyze again, or "
+            "leave out --model."
         )
 
 
@@ -511,7 +531,9 @@ def _require_unflagged_parameters(
             _effect_key(name) in use.required_parameters or not is_covered
         ):
             raise IdentifiedBeamError(
-                f"{headline_label}.parameters.{name} is flagged ({estimate.flag[:100]}), and {use.name} relies on it; record a session that shows more modes or is longer and analyze it, or leave out --model."
+                f"{headline_label}.parameters.{name} is flagged ({estimate.flag[:100]}), and "
+                f"{use.name} relies on it; record a session that shows more modes or is longer "
+                "and analyze it, or leave out --model."
             )
 
 
@@ -533,7 +555,9 @@ def _check_offset_modes(headline_label: str, values_by_name: Mapping[str, float]
     )
     if offset_mode_numbers != list(range(2, 2 + len(offset_mode_numbers))):
         raise IdentifiedBeamError(
-            f"{headline_label}.parameters: {OFFSET_PREFIX}… are those of modes {', '.join(map(str, offset_mode_numbers))}, but must be those of modes 2 to {1 + len(offset_mode_numbers)}; {_WRITE_DOCUMENT_ADVICE}."
+            f"{headline_label}.parameters: {OFFSET_PREFIX}… are those of modes "
+            f"{', '.join(map(str, offset_mode_numbers))}, but must be those of modes 2 to "
+            f"{1 + len(offset_mode_numbers)}; {_WRITE_DOCUMENT_ADVICE}."
         )
 
 
@@ -545,7 +569,8 @@ def _mode_uncertainties(headline_label: str, mode_documents: object) -> Iterator
         mode = ReportedMode.from_json(document, 0)
         if mode is None or mode.number != number:
             raise IdentifiedBeamError(
-                f"{headline_label}.modes[{number - 1}] is not mode {number} with frequency_hz and damping_ratio; {_WRITE_DOCUMENT_ADVICE}."
+                f"{headline_label}.modes[{number - 1}] is not mode {number} with frequency_hz "
+                f"and damping_ratio; {_WRITE_DOCUMENT_ADVICE}."
             )
         yield hypot(
             (_standard_deviation(mode.frequency_hz) or 0.0) / mode.frequency_hz.value,

@@ -287,7 +287,8 @@ def _bus_row(bus_load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
     return CheckRow(
         "CAN bus",
         "load",
-        f"{100 * bus_load.worst_case_load:.1f} % at worst, {100 * bus_load.load_without_stuffing:.1f} % without stuffing",
+        f"{100 * bus_load.worst_case_load:.1f} % at worst, "
+        f"{100 * bus_load.load_without_stuffing:.1f} % without stuffing",
         f"at most {100 * MAX_BUS_LOAD:.0f} %",
         grade(
             fail=bus_load.worst_case_load > MAX_BUS_LOAD,

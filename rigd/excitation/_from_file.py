@@ -126,7 +126,8 @@ def _read_columns(
     ):
         row_index = int(np.argmax(is_not_increasing)) + 1
         raise ExcitationError(
-            f"{path}: line {text_table.line_numbers[row_index]}: {TIME_COLUMN} does not come after the "
+            f"{path}: line {text_table.line_numbers[row_index]}: {TIME_COLUMN} does not come "
+            "after the "
             "one before it; times must increase."
         )
     return (None if time_column is None else time_column.values), angle_column.values

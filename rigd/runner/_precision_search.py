@@ -302,7 +302,10 @@ class ExcitationPlanner:
             self._doubtful_count = self._doubtful_count + 1 if doubt_text else 0
         if self._doubtful_count >= _MAX_DOUBTFUL_FITS:
             findings_text = " ".join(fit_document["findings"])
-            end_reason = f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: rigd run chirp."
+            end_reason = (
+                f"The record is doubtful: {doubt_text}. {findings_text} Record a chirp instead: "
+                "rigd run chirp."
+            )
             yield self._search_end_message(end_reason.replace("  ", " "), is_reached=False)
             return
         try:
@@ -568,7 +571,8 @@ class ExcitationPlanner:
         )
         return [
             *table_rows,
-            f"{record_time_s:5.1f} s {row_text}{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
+            f"{record_time_s:5.1f} s "
+            f"{row_text}{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
         ]
 
     def targets_document(self, fit_document: Mapping[str, Any]) -> dict[str, Any]:
@@ -677,7 +681,11 @@ class _TimeForecast:
         else:
             required_time_text = f"about {required_s:.0f} s more"
             longer_record_text = f", or give --at-most {1.2 * (now_s + required_s):.0f}"
-        return f"it would take {required_time_text}, and the remaining {available_s:.0f} s suffice for {reachable_ratio:.2g} times the requested standard deviation. Request that{longer_record_text}."
+        return (
+            f"it would take {required_time_text}, and the remaining {available_s:.0f} s suffice "
+            f"for {reachable_ratio:.2g} times the requested standard deviation. Request "
+            f"that{longer_record_text}."
+        )
 
 
 def _cell_text(target_estimate: TargetEstimate) -> str:
@@ -716,4 +724,7 @@ def _estimate_text(target_estimate: TargetEstimate) -> str:
     """Return text with one estimate and its standard deviation, or why it is doubtful."""
     if target_estimate.value is None or target_estimate.doubt:
         return f"{target_estimate.name}: {target_estimate.doubt}"
-    return f"{target_estimate.name} {target_estimate.value:.5g}, standard deviation {with_percentage(target_estimate.std, target_estimate.value)}"
+    return (
+        f"{target_estimate.name} {target_estimate.value:.5g}, standard deviation "
+        f"{with_percentage(target_estimate.std, target_estimate.value)}"
+    )

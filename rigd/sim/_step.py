@@ -141,7 +141,9 @@ def drifted_step_arrays(
         )
     except RealisationError as error:
         raise RealisationError(
-            f"simulation.stiffness_drift_per_s: this beam cannot be simulated at {stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. {error}"
+            "simulation.stiffness_drift_per_s: this beam cannot be simulated at "
+            f"{stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift "
+            f"out. {error}"
         ) from error
     free_shaft_model, locked_shaft_model = (
         with_modal_displacements(coupled_model, drifted_realisation, initial_realisation)

@@ -191,7 +191,8 @@ def test_search_gives_up_on_a_doubtful_record(bench):
         assert bench.writer.ticks < 50 * RATE_HZ
     assert not ends[0].reached
     assert ends[0].reason == (
-        "The record is doubtful: part of the record is unexplained. Something struck the beam. Record a chirp instead: rigd run chirp."
+        "The record is doubtful: part of the record is unexplained. Something struck the beam. "
+        "Record a chirp instead: rigd run chirp."
     )
     assert messages[0].document["text"][-1].count("doubtful") == 3
 
