@@ -57,6 +57,6 @@ class RecordEstimate:
             fit=replace(candidate.fit, residual=np.empty(0, np.complex128)),
             deviance=candidate.deviance,
             bic=candidate.bic,
-            compared_values=candidate.values,
+            compared_values=candidate.compared_value_count,
             indices=indices,
         )

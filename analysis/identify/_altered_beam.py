@@ -39,26 +39,26 @@ GRAVITY_M_S2: Final = 9.81
 _BASIS_MODE_COUNT: Final = 14
 """Number of modes of the uniform beam in the basis."""
 
-_NEXT_EIGENVALUE: Final = float(clamped_free_eigenvalues(_BASIS_MODE_COUNT + 1)[-1])
+_EIGENVALUE_BEYOND_BASIS: Final = float(clamped_free_eigenvalues(_BASIS_MODE_COUNT + 1)[-1])
 """Eigenvalue k L of the first mode of the uniform beam that is not in the basis."""
 
 _QUADRATURE_POINTS_PER_HALF: Final = 32
 """Number of quadrature points in each half of the beam."""
 
-_SLOPE_STEP: Final = 1e-5
+_NUMERICAL_SLOPE_STEP: Final = 1e-5
 """Step of the relative position for numerical slopes of mode shapes, which are exact to a relative
 error of 1e-8."""
 
-_INVERSE_ITERATIONS: Final = 2
+_INVERSE_ITERATION_COUNT: Final = 2
 """Number of inverse iterations for a mode shape with a lossy clamp."""
 
-_RELATIVE_SHIFT: Final = 1e-7
+_RELATIVE_EIGENVALUE_SHIFT: Final = 1e-7
 """Shift of an inverse iteration relative to the eigenvalue: the matrix is not singular."""
 
 CoefficientArray = NDArray[np.inexact[Any]]
 """Array of real or complex Galerkin coefficients."""
 
-Profile = Literal["taper", "outer half", "wave"]
+DeviationProfile = Literal["taper", "outer half", "wave"]
 """Shape of a relative deviation along the beam.
 
 "taper" rises from -1/2 to 1/2, "outer half" is 0 in the inner and 1 in the outer half, and "wave"
@@ -66,73 +66,75 @@ is a cosine of one period."""
 
 
 @dataclass(frozen=True, slots=True)
-class Alteration:
+class BeamDeviations:
     """Deviations of a rig from a uniform beam on a rigid clamp with an ideal torque channel.
 
     Attributes
     ----------
-    lumps : tuple of (float, float)
+    point_masses : tuple of (float, float)
         Added point masses: position relative to the length, and mass in kg.
     gravity_m_s2 : float
         Component of gravity along the beam at rest, positive towards the tip.
-    density, stiffness : tuple of (str, float)
+    density_deviations, stiffness_deviations : tuple of (str, float)
         Relative deviations of the mass per length and of the bending stiffness: profile and size.
     clamp_compliance : float
         Compliance of the clamp, times EI over the length.
     clamp_loss : float
         Loss factor of the clamp.
-    relaxation : tuple of (float, float)
+    relaxation_strength_and_time : tuple of (float, float)
         Strength and time constant (s) of a relaxation of the material: the stiffness gains
         ``strength s t / (1 + s t)``.
-    sensor_lag : tuple of (float, float)
+    second_order_torque_lag : tuple of (float, float)
         Second-order lag in the torque channel: reciprocal of its undamped frequency (s), and of its
         quality factor.
-    lag_s : float
+    first_order_torque_lag_s : float
         Time constant of a first-order lag in the torque channel.
     """
 
-    lumps: tuple[tuple[float, float], ...] = ()
+    point_masses: tuple[tuple[float, float], ...] = ()
     gravity_m_s2: float = 0.0
-    density: tuple[tuple[Profile, float], ...] = ()
-    stiffness: tuple[tuple[Profile, float], ...] = ()
+    density_deviations: tuple[tuple[DeviationProfile, float], ...] = ()
+    stiffness_deviations: tuple[tuple[DeviationProfile, float], ...] = ()
     clamp_compliance: float = 0.0
     clamp_loss: float = 0.0
-    relaxation: tuple[float, float] = (0.0, 1.0)
-    sensor_lag: tuple[float, float] = (0.0, 0.0)
-    lag_s: float = 0.0
+    relaxation_strength_and_time: tuple[float, float] = (0.0, 1.0)
+    second_order_torque_lag: tuple[float, float] = (0.0, 0.0)
+    first_order_torque_lag_s: float = 0.0
 
     @classmethod
-    def from_nominal(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
-        """Return the alteration of the beam that the session file states: tip mass and tilt.
+    def from_nominal_plant(
+        cls, nominal_plant: Plant, tilt_deg: float | None = None
+    ) -> BeamDeviations:
+        """Return the deviations of the beam that the session file states: tip mass and tilt.
 
         The angle between the beam at rest and the horizontal is positive if the tip is lower than
         the root; None counts as 0.
         """
-        mass_kg = nominal.tip_mass_kg
+        mass_kg = nominal_plant.tip_mass_kg
         return cls(
-            lumps=((1.0, mass_kg),) if mass_kg else (),
+            point_masses=((1.0, mass_kg),) if mass_kg else (),
             gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(tilt_deg or 0.0)),
         )
 
-    def has_same_shapes(self, other_alteration: Alteration) -> bool:
-        """Return whether two alterations of the beam result in the same mode shapes.
+    def has_same_mode_shapes(self, other_deviations: BeamDeviations) -> bool:
+        """Return whether two sets of deviations result in the same mode shapes.
 
         They then differ at most in the relaxation of the material and in the lags of the torque
         channel, which do not affect the mode shapes.
         """
         return self == replace(
-            other_alteration,
-            relaxation=self.relaxation,
-            sensor_lag=self.sensor_lag,
-            lag_s=self.lag_s,
+            other_deviations,
+            relaxation_strength_and_time=self.relaxation_strength_and_time,
+            second_order_torque_lag=self.second_order_torque_lag,
+            first_order_torque_lag_s=self.first_order_torque_lag_s,
         )
 
     @property
-    def lags(self) -> tuple[tuple[float, float], ...]:
+    def torque_lag_denominators(self) -> tuple[tuple[float, float], ...]:
         """Return the coefficients of s and s² in the denominator of each low-pass of the torque."""
-        time_s, inverse_quality = self.sensor_lag
-        lags = ((inverse_quality * time_s, time_s**2), (self.lag_s, 0.0))
-        return tuple(lag for lag in lags if any(lag))
+        time_s, inverse_quality = self.second_order_torque_lag
+        denominators = ((inverse_quality * time_s, time_s**2), (self.first_order_torque_lag_s, 0.0))
+        return tuple(lag for lag in denominators if any(lag))
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,89 +145,96 @@ class ModeTerms:
 
     Attributes
     ----------
-    stiffness, clamp, mass, lump, tension : ndarray, shape (n,)
+    stiffness, clamp_stiffness, mass, point_mass, tension : ndarray, shape (n,)
         Coefficients of D: ``K / L⁴``, ``C / L⁴``, M without the point masses, M of the point
         masses, and ``g T / L``, with the length L of the beam.
-    mass_arm, lump_arm, medium_arm, tension_arm : ndarray, shape (n,)
+    mass_arm, point_mass_arm, external_damping_arm, tension_arm : ndarray, shape (n,)
         Arms of the forces of mass, point masses, external damping and tension about the motor's
         axis, divided by the length; complex if the clamp has a loss.
-    arm_change_by_external, arm_change_by_internal : ndarray, shape (n,)
+    arm_change_per_external_damping, arm_change_per_internal_damping : ndarray, shape (n,)
         Change of the arm of the mass per ``gamma s^lambda`` and per ``zeta s^alpha``, since damping
         changes the mode shape.
     density_kg_per_m : float or None
-        Mass per length for which `lump` is valid. None if the point masses are constant fractions
-        of the mass of the beam.
-    alteration : Alteration
-        Alteration of the beam.
+        Mass per length for which `point_mass` is valid. None if the point masses are constant
+        fractions of the mass of the beam.
+    deviations : BeamDeviations
+        Deviations from a uniform beam.
     """
 
     stiffness: CoefficientArray
-    clamp: CoefficientArray
+    clamp_stiffness: CoefficientArray
     mass: CoefficientArray
-    lump: CoefficientArray
+    point_mass: CoefficientArray
     tension: CoefficientArray
     mass_arm: CoefficientArray
-    lump_arm: CoefficientArray
-    medium_arm: CoefficientArray
+    point_mass_arm: CoefficientArray
+    external_damping_arm: CoefficientArray
     tension_arm: CoefficientArray
-    arm_change_by_external: CoefficientArray
-    arm_change_by_internal: CoefficientArray
+    arm_change_per_external_damping: CoefficientArray
+    arm_change_per_internal_damping: CoefficientArray
     density_kg_per_m: float | None
-    alteration: Alteration
+    deviations: BeamDeviations
 
     def coefficients_by_mode(self) -> Iterable[tuple[complex, ...]]:
         """Return one tuple of coefficients for each mode, in the order of the attributes."""
-        return zip(*(terms.tolist() for terms in _coefficient_arrays(self)), strict=True)
+        return zip(*(terms.tolist() for terms in _get_coefficient_arrays(self)), strict=True)
 
 
-_coefficient_arrays: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
+_get_coefficient_arrays: Final = attrgetter(*(field.name for field in fields(ModeTerms)[:-2]))
 """Function that returns the coefficients of `ModeTerms`: all attributes that are arrays."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Basis:
+class _ModeBasis:
     """First N modes of the uniform beam at quadrature points, and integrals over their shapes.
 
-    `z` are the eigenvalues k L, and `x` the quadrature points, as positions relative to the length,
-    with their `weights`. `shapes`, `slopes` and `curvatures` have the shape (N, points). `arms` are
-    the integrals of ``shape x`` and `arms_of_tension` those of ``slope (1 - x)``, both of shape
-    (N,). `tension` are the integrals of ``slope_i slope_j (1 - x)``, shape (N, N).
+    `eigenvalues` are the eigenvalues k L, and `positions` the quadrature points, as positions
+    relative to the length, with their `quadrature_weights`. `shapes`, `slopes` and `curvatures`
+    have the shape (N, points). `mass_arms` are the integrals of ``shape x`` and `tension_arms`
+    those of ``slope (1 - x)``, both of shape (N,). `tension_integrals` are the integrals of
+    ``slope_i slope_j (1 - x)``, shape (N, N).
     """
 
-    z: NDArray[np.float64]
-    x: NDArray[np.float64]
-    weights: NDArray[np.float64]
+    eigenvalues: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    quadrature_weights: NDArray[np.float64]
     shapes: NDArray[np.float64]
     slopes: NDArray[np.float64]
     curvatures: NDArray[np.float64]
-    arms: NDArray[np.float64]
-    arms_of_tension: NDArray[np.float64]
-    tension: NDArray[np.float64]
+    mass_arms: NDArray[np.float64]
+    tension_arms: NDArray[np.float64]
+    tension_integrals: NDArray[np.float64]
 
-    def weighted_products(
-        self, rows: NDArray[np.float64], profile: NDArray[np.float64]
+    def weighted_product_integrals(
+        self, function_values: NDArray[np.float64], weight_function: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the integrals over the beam of all pairwise products of N functions, shape (N, N).
 
-        `rows` are the values of the N functions at the quadrature points. Each product is weighted
-        by `profile`, the values of another function at these points.
+        `function_values` are the values of the N functions at the quadrature points. Each product
+        is weighted by `weight_function`, the values of another function at these points.
         """
-        integrals: NDArray[np.float64] = (rows * (self.weights * profile)) @ rows.T
+        integrals: NDArray[np.float64] = (
+            function_values * (self.quadrature_weights * weight_function)
+        ) @ function_values.T
         return integrals
 
-    def deviation(self, deviations: Sequence[tuple[Profile, float]]) -> NDArray[np.float64]:
+    def total_deviation(
+        self, profiles_and_sizes: Sequence[tuple[DeviationProfile, float]]
+    ) -> NDArray[np.float64]:
         """Return the total relative deviation of density or stiffness at the quadrature points.
 
-        It is the sum of `deviations`, each given by its profile along the beam and its size. The
-        shape is (points,).
+        It is the sum of `profiles_and_sizes`, each given by its profile along the beam and its
+        size. The shape is (points,).
         """
-        total_deviation = np.zeros(self.x.size)
-        for profile, size in deviations:
-            total_deviation += size * _PROFILE_FUNCTIONS[profile](self.x)
-        return total_deviation
+        deviation_sum = np.zeros(self.positions.size)
+        for profile, size in profiles_and_sizes:
+            deviation_sum += size * _PROFILE_FUNCTIONS[profile](self.positions)
+        return deviation_sum
 
 
-_PROFILE_FUNCTIONS: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = {
+_PROFILE_FUNCTIONS: Final[
+    dict[DeviationProfile, Callable[[NDArray[np.float64]], NDArray[np.float64]]]
+] = {
     "taper": lambda x: x - 0.5,
     "outer half": lambda x: np.where(x > 0.5, 1.0, 0.0),
     "wave": lambda x: np.cos(2 * np.pi * x),
@@ -233,13 +242,15 @@ _PROFILE_FUNCTIONS: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[
 """Deviation as a function of the relative position along the beam, for each profile."""
 
 
-def _basis_shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _basis_shapes(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the shapes of the N basis modes at positions relative to the length, (N, …)."""
-    return np.array([mode_shape(mode_number, x) for mode_number in range(1, _BASIS_MODE_COUNT + 1)])
+    return np.array(
+        [mode_shape(mode_number, positions) for mode_number in range(1, _BASIS_MODE_COUNT + 1)]
+    )
 
 
 @lru_cache(maxsize=32)
-def _basis_shapes_at_lump(position: float) -> NDArray[np.float64]:
+def _basis_shapes_at_position(position: float) -> NDArray[np.float64]:
     """Return the basis modes' deflections at one position relative to the length, shape (N,).
 
     The array is cached and must not be changed.
@@ -248,112 +259,140 @@ def _basis_shapes_at_lump(position: float) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=1)
-def _basis() -> _Basis:
+def _uniform_beam_basis() -> _ModeBasis:
     """Return the cached basis: the first modes of the uniform beam, with their integrals."""
     quadrature_nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS_PER_HALF)
-    x = np.concatenate([0.25 * (quadrature_nodes + 1), 0.25 * (quadrature_nodes + 3)])
+    positions = np.concatenate([0.25 * (quadrature_nodes + 1), 0.25 * (quadrature_nodes + 3)])
     weights = np.tile(weights / 4, 2)
-    z = clamped_free_eigenvalues(_BASIS_MODE_COUNT)
-    signs = (-1.0) ** np.arange(_BASIS_MODE_COUNT)
+    eigenvalues = clamped_free_eigenvalues(_BASIS_MODE_COUNT)
+    alternating_signs = (-1.0) ** np.arange(_BASIS_MODE_COUNT)
     shapes, slopes = (
-        _basis_shapes(x),
-        (_basis_shapes(x + _SLOPE_STEP) - _basis_shapes(x - _SLOPE_STEP)) / (2 * _SLOPE_STEP),
+        _basis_shapes(positions),
+        (
+            _basis_shapes(positions + _NUMERICAL_SLOPE_STEP)
+            - _basis_shapes(positions - _NUMERICAL_SLOPE_STEP)
+        )
+        / (2 * _NUMERICAL_SLOPE_STEP),
     )
-    return _Basis(
-        z=z,
-        x=x,
-        weights=weights,
+    return _ModeBasis(
+        eigenvalues=eigenvalues,
+        positions=positions,
+        quadrature_weights=weights,
         shapes=shapes,
         slopes=slopes,
         # The moment of a clamped-free mode is the shape of a clamped-free mode seen from its tip.
-        curvatures=(signs * z**2)[:, None] * _basis_shapes(1 - x),
-        arms=2 * signs / z**2,
-        arms_of_tension=slopes @ (weights * (1 - x)),
-        tension=(slopes * (weights * (1 - x))) @ slopes.T,
+        curvatures=(alternating_signs * eigenvalues**2)[:, None] * _basis_shapes(1 - positions),
+        mass_arms=2 * alternating_signs / eigenvalues**2,
+        tension_arms=slopes @ (weights * (1 - positions)),
+        tension_integrals=(slopes * (weights * (1 - positions))) @ slopes.T,
     )
 
 
 @lru_cache(maxsize=16)
-def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
+def galerkin_mode_terms(
+    deviations: BeamDeviations, beam: Beam, mode_numbers: tuple[int, ...]
+) -> ModeTerms:
     """Return the Galerkin coefficients of the given modes of an altered beam.
 
-    `modes` are mode numbers, from 1. For each point mass one mode is added to the basis. It
+    `mode_numbers` are mode numbers, from 1. For each point mass one mode is added to the basis. It
     represents all higher modes.
     """
-    basis = _basis()
-    length_m, mode_indices = beam.length_m, np.array(modes) - 1
-    lump_count = len(alteration.lumps)
+    basis = _uniform_beam_basis()
+    length_m, mode_indices = beam.length_m, np.array(mode_numbers) - 1
+    point_mass_count = len(deviations.point_masses)
 
-    def with_lump_modes(
+    def with_point_mass_modes(
         uniform_beam_array: NDArray[np.float64], diagonal_value: float = 0.0
     ) -> NDArray[np.float64]:
-        if not lump_count:
+        if not point_mass_count:
             return uniform_beam_array
-        extended_array = np.zeros((_BASIS_MODE_COUNT + lump_count,) * uniform_beam_array.ndim)
+        extended_array = np.zeros((_BASIS_MODE_COUNT + point_mass_count,) * uniform_beam_array.ndim)
         extended_array[(slice(_BASIS_MODE_COUNT),) * uniform_beam_array.ndim] = uniform_beam_array
-        lump_indices = range(_BASIS_MODE_COUNT, _BASIS_MODE_COUNT + lump_count)
-        extended_array[(lump_indices,) * uniform_beam_array.ndim] = diagonal_value
+        point_mass_indices = range(_BASIS_MODE_COUNT, _BASIS_MODE_COUNT + point_mass_count)
+        extended_array[(point_mass_indices,) * uniform_beam_array.ndim] = diagonal_value
         return extended_array
 
-    density_deviation = basis.deviation(alteration.density)
-    mass = with_lump_modes(
-        np.eye(_BASIS_MODE_COUNT) + basis.weighted_products(basis.shapes, density_deviation), 1.0
+    density_deviation = basis.total_deviation(deviations.density_deviations)
+    mass = with_point_mass_modes(
+        np.eye(_BASIS_MODE_COUNT)
+        + basis.weighted_product_integrals(basis.shapes, density_deviation),
+        1.0,
     )
-    mass_arm = with_lump_modes(
-        basis.arms + basis.shapes @ (basis.weights * density_deviation * basis.x)
+    mass_arm = with_point_mass_modes(
+        basis.mass_arms
+        + basis.shapes @ (basis.quadrature_weights * density_deviation * basis.positions)
     )
-    lump, lump_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
-    tension, tension_arm = with_lump_modes(basis.tension), with_lump_modes(basis.arms_of_tension)
-    for lump_index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS_MODE_COUNT):
+    point_mass, point_mass_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
+    tension, tension_arm = (
+        with_point_mass_modes(basis.tension_integrals),
+        with_point_mass_modes(basis.tension_arms),
+    )
+    for point_mass_index, (position, mass_kg) in enumerate(
+        deviations.point_masses, start=_BASIS_MODE_COUNT
+    ):
         mass_fraction, shape = (
             mass_kg / (beam.density_kg_per_m * length_m),
-            with_lump_modes(_basis_shapes_at_lump(position).copy()),
+            with_point_mass_modes(_basis_shapes_at_position(position).copy()),
         )
         # All modes beyond the basis act on a point mass as one spring, and move as one mode.
         flexibility_beyond_basis = position**3 / 3 - float(
-            np.sum((shape[:_BASIS_MODE_COUNT] / basis.z**2) ** 2)
+            np.sum((shape[:_BASIS_MODE_COUNT] / basis.eigenvalues**2) ** 2)
         )
-        shape[lump_index] = math.sqrt(max(flexibility_beyond_basis, 0.0)) * _NEXT_EIGENVALUE**2
-        lump += mass_fraction * np.outer(shape, shape)
-        lump_arm += mass_fraction * position * shape
-        if alteration.gravity_m_s2:
-            mass_outboard = np.where(basis.x < position, mass_fraction, 0.0)
-            tension = tension + with_lump_modes(
-                basis.weighted_products(basis.slopes, mass_outboard)
+        shape[point_mass_index] = (
+            math.sqrt(max(flexibility_beyond_basis, 0.0)) * _EIGENVALUE_BEYOND_BASIS**2
+        )
+        point_mass += mass_fraction * np.outer(shape, shape)
+        point_mass_arm += mass_fraction * position * shape
+        if deviations.gravity_m_s2:
+            outboard_mass_fraction = np.where(basis.positions < position, mass_fraction, 0.0)
+            tension = tension + with_point_mass_modes(
+                basis.weighted_product_integrals(basis.slopes, outboard_mass_fraction)
             )
             tension_arm = tension_arm + mass_fraction * shape
     # Flexibility of beam and clamp to loads with the shapes of the basis
-    moments = basis.curvatures / basis.z[:, None] ** 4
-    relative_flexibility = 1 / (1 + basis.deviation(alteration.stiffness))
-    beam_flexibility = with_lump_modes(
-        basis.weighted_products(moments, relative_flexibility), _NEXT_EIGENVALUE**-4.0
+    bending_moments = basis.curvatures / basis.eigenvalues[:, None] ** 4
+    relative_flexibility = 1 / (1 + basis.total_deviation(deviations.stiffness_deviations))
+    beam_flexibility = with_point_mass_modes(
+        basis.weighted_product_integrals(bending_moments, relative_flexibility),
+        _EIGENVALUE_BEYOND_BASIS**-4.0,
     )
-    root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODE_COUNT) / basis.z**2)
-    clamp_flexibility: CoefficientArray = alteration.clamp_compliance * np.outer(
+    root_moments = with_point_mass_modes(
+        2 * (-1.0) ** np.arange(_BASIS_MODE_COUNT) / basis.eigenvalues**2
+    )
+    clamp_flexibility: CoefficientArray = deviations.clamp_compliance * np.outer(
         root_moments, root_moments
     )
     elastic_stiffness: CoefficientArray = np.linalg.inv(beam_flexibility + clamp_flexibility)
-    gravity_factor = alteration.gravity_m_s2 * beam.density_over_stiffness * length_m**3
+    gravity_factor = deviations.gravity_m_s2 * beam.density_over_stiffness * length_m**3
     # Eigenvalues are 1 / omega²: the largest ones, of the lowest modes, are the most exact.
     inverse_factor = np.linalg.inv(np.linalg.cholesky(elastic_stiffness + gravity_factor * tension))
-    inverse_squares, eigenvectors = np.linalg.eigh(
-        inverse_factor @ (mass + lump) @ inverse_factor.T
+    inverse_squared_frequencies, eigenvectors = np.linalg.eigh(
+        inverse_factor @ (mass + point_mass) @ inverse_factor.T
     )
-    inverse_squares, eigenvectors = inverse_squares[::-1], eigenvectors[:, ::-1]
-    all_shapes = inverse_factor.T @ eigenvectors / np.sqrt(inverse_squares)  # of modal mass 1
+    inverse_squared_frequencies, eigenvectors = (
+        inverse_squared_frequencies[::-1],
+        eigenvectors[:, ::-1],
+    )
+    all_shapes = (
+        inverse_factor.T @ eigenvectors / np.sqrt(inverse_squared_frequencies)
+    )  # of modal mass 1
     shapes: CoefficientArray = all_shapes[:, mode_indices]
-    if alteration.clamp_loss:
-        clamp_flexibility = clamp_flexibility / (1 + 1j * alteration.clamp_loss)
+    if deviations.clamp_loss:
+        clamp_flexibility = clamp_flexibility / (1 + 1j * deviations.clamp_loss)
         elastic_stiffness = np.linalg.inv(beam_flexibility + clamp_flexibility)
-        shapes = _complex_shapes(elastic_stiffness + gravity_factor * tension, mass + lump, shapes)
+        shapes = _complex_shapes(
+            elastic_stiffness + gravity_factor * tension, mass + point_mass, shapes
+        )
     modal_loads = elastic_stiffness @ shapes
     modal_masses = np.sum(shapes * shapes, axis=0)
     # Losses change the mode shapes to first order, and so the phase of the residues.
-    eigenvalue_differences = 1 / inverse_squares[mode_indices] - 1 / inverse_squares[:, None]
+    eigenvalue_differences = (
+        1 / inverse_squared_frequencies[mode_indices] - 1 / inverse_squared_frequencies[:, None]
+    )
     eigenvalue_differences[mode_indices, np.arange(mode_indices.size)] = np.inf
-    mass_arms = (mass_arm + lump_arm) @ all_shapes
-    arm_change_by_external = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
-    arm_change_by_internal = mass_arms @ (
+    mass_arms = (mass_arm + point_mass_arm) @ all_shapes
+    arm_change_per_external_damping = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
+    arm_change_per_internal_damping = mass_arms @ (
         ((elastic_stiffness @ all_shapes).T @ beam_flexibility @ modal_loads)
         / eigenvalue_differences
     )
@@ -364,26 +403,28 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
         )
         return coefficients
 
-    root_modal_masses = np.sqrt(modal_masses)
-    gravity_per_length = alteration.gravity_m_s2 / length_m
+    sqrt_modal_masses = np.sqrt(modal_masses)
+    gravity_per_length = deviations.gravity_m_s2 / length_m
     return ModeTerms(
         stiffness=np.sum(modal_loads * (beam_flexibility @ modal_loads), axis=0)
         / modal_masses
         / length_m**4,
-        clamp=np.sum(modal_loads * (clamp_flexibility @ modal_loads), axis=0)
+        clamp_stiffness=np.sum(modal_loads * (clamp_flexibility @ modal_loads), axis=0)
         / modal_masses
         / length_m**4,
         mass=modal_coefficients(mass),
-        lump=modal_coefficients(lump),
+        point_mass=modal_coefficients(point_mass),
         tension=gravity_per_length * modal_coefficients(tension),
-        mass_arm=mass_arm @ shapes / root_modal_masses,
-        lump_arm=lump_arm @ shapes / root_modal_masses,
-        medium_arm=with_lump_modes(basis.arms) @ shapes / root_modal_masses,
-        tension_arm=gravity_per_length * (tension_arm @ shapes) / root_modal_masses,
-        arm_change_by_external=arm_change_by_external / root_modal_masses * length_m**4,
-        arm_change_by_internal=arm_change_by_internal / root_modal_masses,
+        mass_arm=mass_arm @ shapes / sqrt_modal_masses,
+        point_mass_arm=point_mass_arm @ shapes / sqrt_modal_masses,
+        external_damping_arm=with_point_mass_modes(basis.mass_arms) @ shapes / sqrt_modal_masses,
+        tension_arm=gravity_per_length * (tension_arm @ shapes) / sqrt_modal_masses,
+        arm_change_per_external_damping=arm_change_per_external_damping
+        / sqrt_modal_masses
+        * length_m**4,
+        arm_change_per_internal_damping=arm_change_per_internal_damping / sqrt_modal_masses,
         density_kg_per_m=beam.density_kg_per_m,
-        alteration=alteration,
+        deviations=deviations,
     )
 
 
@@ -399,10 +440,10 @@ def _complex_shapes(
     """
     complex_shapes = lossless_shapes.astype(np.complex128)
     for shape in complex_shapes.T:
-        for _ in range(_INVERSE_ITERATIONS):
+        for _ in range(_INVERSE_ITERATION_COUNT):
             eigenvalue = (shape @ stiffness_matrix @ shape) / (shape @ mass_matrix @ shape)
             next_shape = np.linalg.solve(
-                stiffness_matrix - eigenvalue * (1 + _RELATIVE_SHIFT) * mass_matrix,
+                stiffness_matrix - eigenvalue * (1 + _RELATIVE_EIGENVALUE_SHIFT) * mass_matrix,
                 mass_matrix @ shape,
             )
             shape[:] = next_shape / np.sqrt(next_shape @ mass_matrix @ next_shape)

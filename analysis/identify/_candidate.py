@@ -12,26 +12,26 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 
-FAR_BEHIND_BIC_DIFFERENCE: Final = 1000.0
+HOPELESS_BIC_DIFFERENCE: Final = 1000.0
 """Difference of BIC to the best candidate above which a candidate is only fitted roughly. It cannot
 become the best one, however exactly its minimum is found."""
 
 
-def deviance(cost: float, value_count: int) -> float:
+def deviance(cost: float, compared_value_count: int) -> float:
     """Return the deviance, ``-2 ln`` of the likelihood plus a constant, for noise of unknown level.
 
-    `cost` is the sum of squares of the whitened residual, and `value_count` the number of real
-    values of the record.
+    `cost` is the sum of squares of the whitened residual, and `compared_value_count` the number of
+    real values of the record.
     """
-    return value_count * math.log(cost / value_count)
+    return compared_value_count * math.log(cost / compared_value_count)
 
 
-def bic(cost: float, value_count: int, parameter_count: int) -> float:
+def bic(cost: float, compared_value_count: int, parameter_count: int) -> float:
     """Return the Bayesian information criterion of a fit.
 
     The cost and the number of values are as for `deviance`.
     """
-    return deviance(cost, value_count) + parameter_count * math.log(value_count)
+    return deviance(cost, compared_value_count) + parameter_count * math.log(compared_value_count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,29 +46,32 @@ class Candidate:
         Damping structure.
     fit : RecordFit
         Fit of this structure to the record.
-    effect_count : int
+    nonlinear_effect_count : int
         Number of nonlinear effects with a free amplitude, in addition to the parameters of the fit.
     """
 
     structure: Structure
     fit: RecordFit
-    effect_count: int = 0
+    nonlinear_effect_count: int = 0
 
     @property
-    def parameters(self) -> int:
+    def parameter_count(self) -> int:
         """Return the number of fitted parameters, except the amplitudes of the free decay.
 
         These amplitudes are common to all candidates.
         """
-        return len(self.fit.interval) + self.effect_count
+        return len(self.fit.interval) + self.nonlinear_effect_count
 
     @property
-    def values(self) -> int:
+    def compared_value_count(self) -> int:
         """Return the number of real values of the record to which the candidate is fitted."""
         fit = self.fit
         decay_amplitude_count = fit.ringing.degrees_of_freedom
         return (
-            fit.degrees_of_freedom + len(fit.interval) + decay_amplitude_count + self.effect_count
+            fit.degrees_of_freedom
+            + len(fit.interval)
+            + decay_amplitude_count
+            + self.nonlinear_effect_count
         )
 
     @property
@@ -77,7 +80,7 @@ class Candidate:
 
         The noise spectrum is known up to its level, which is estimated.
         """
-        return deviance(self.fit.cost, self.values)
+        return deviance(self.fit.cost, self.compared_value_count)
 
     @property
     def bic(self) -> float:
@@ -85,7 +88,7 @@ class Candidate:
 
         G. Schwarz, Annals of Statistics 6 (1978) 461-464.
         """
-        return bic(self.fit.cost, self.values, self.parameters)
+        return bic(self.fit.cost, self.compared_value_count, self.parameter_count)
 
     @property
     def aic(self) -> float:
@@ -93,7 +96,7 @@ class Candidate:
 
         H. Akaike, IEEE Trans. Automatic Control 19 (1974) 716-723.
         """
-        return self.deviance + 2 * self.parameters
+        return self.deviance + 2 * self.parameter_count
 
     @property
     def name(self) -> str:
@@ -107,14 +110,14 @@ class DragEstimate:
 
     Attributes
     ----------
-    value_m : float
-        Drag coefficient times diameter, C_D d, at `speed_m_s`, for an assumed density of the air of
-        1.2 kg/m³.
+    drag_m : float
+        Drag coefficient times diameter, C_D d, at `pivot_speed_m_s`, for an assumed density of the
+        air of 1.2 kg/m³.
     std_m : float
-        Standard deviation of `value_m`.
+        Standard deviation of `drag_m`.
     interval_95_m : tuple of float
-        95 % interval of `value_m`, not below 0.
-    speed_m_s : float
+        95 % interval of `drag_m`, not below 0.
+    pivot_speed_m_s : float
         Speed at which C_D d has the smallest uncertainty. If `law` is constant, the mean speed,
         weighted with the power dissipated by drag.
     law : DragLaw
@@ -124,9 +127,9 @@ class DragEstimate:
         estimated.
     """
 
-    value_m: float
+    drag_m: float
     std_m: float
     interval_95_m: tuple[float, float]
-    speed_m_s: float
+    pivot_speed_m_s: float
     law: DragLaw
     covariance: tuple[tuple[float, ...], ...]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE, Candidate, DragEstimate
+from analysis.identify._candidate import HOPELESS_BIC_DIFFERENCE, Candidate, DragEstimate
 from analysis.identify._channel_checks import sign_and_unit_findings
 from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record, refit_record
@@ -52,14 +52,14 @@ _MIN_DEVIANCE_OF_DAMPING: Final = 4.0
 damping with a smaller reduction is omitted: it moves no other parameter by more than two
 standard deviations, and only makes the others uncertain."""
 
-_CERTAIN_COEFFICIENT_OVER_STD: Final = 5.0
+_CERTAIN_DAMPING_STD_RATIO: Final = 5.0
 """Ratio of a damping coefficient to its standard deviation above which the damping is certainly
 significant, so that no structure without it is fitted."""
 
 _FREEST_STRUCTURE: Final = STRUCTURES["VI"]
 """Structure with internal and external damping, both of free order."""
 
-_ONE_DAMPING_STRUCTURES: Final = (STRUCTURES["IV"], STRUCTURES["V"])
+_SINGLE_DAMPING_STRUCTURES: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 """Structures with only internal or only external damping, of free order."""
 
 _INTEGER_ORDER_STRUCTURE: Final = STRUCTURES["VII"]
@@ -114,7 +114,7 @@ class CandidateSet:
     def from_measurement(
         cls,
         measurement: Measurement,
-        fixed: tuple[Setting, ...],
+        fixed_settings: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet:
         """Fit every damping structure to a record, on a uniform beam; return the candidate set.
@@ -122,15 +122,16 @@ class CandidateSet:
         If a sign or unit of the record is wrong, only the freest structure is fitted. Raise
         `MeasurementError` if the record cannot be used.
         """
-        if misread := tuple(
+        if misread_findings := tuple(
             sign_and_unit_findings(Comparison.from_measurement(measurement, band_hz))
         ):
             # No beam explains such a record, so all structures leave much the same residual.
             return replace(
-                cls.fit_freest_structure(measurement, fixed, band_hz), misread_findings=misread
+                cls.fit_freest_structure(measurement, fixed_settings, band_hz),
+                misread_findings=misread_findings,
             )
         candidate_set = cls._from_uniform_beam(
-            fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed
+            fit_record(measurement, fixed=fixed_settings, band_hz=band_hz), fixed_settings
         )
         return candidate_set._exclude_leakage()
 
@@ -139,32 +140,33 @@ class CandidateSet:
         cls,
         earlier_candidates: Sequence[Candidate],
         measurement: Measurement,
-        fixed: tuple[Setting, ...],
+        fixed_settings: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet | None:
         """Refit candidates that were fitted to the beginning of a record to the longer record.
 
         Each descent starts from the earlier estimate of the candidate. Return None if the residual
         of the first candidate exceeds the noise: then a full search is needed. The earlier
-        candidates are in the order of rising BIC. Settings in `fixed` stay at the values the file
-        states. Raise `MeasurementError` if the record cannot be used.
+        candidates are in the order of rising BIC. Settings in `fixed_settings` stay at the values
+        the file states. Raise `MeasurementError` if the record cannot be used.
         """
         first_candidate, *other_candidates = earlier_candidates
         unknowns = Unknowns.for_structure(
-            first_candidate.structure, measurement.nominal, free_settings(fixed)
+            first_candidate.structure, measurement.nominal, free_settings(fixed_settings)
         )
         analysis = refit_record(measurement, unknowns, first_candidate.fit.plant, band_hz=band_hz)
         if analysis is None:
             return None
         candidate_set = cls._from_analysis(
-            analysis, fixed, (replace(first_candidate, fit=analysis.fits[0]),)
+            analysis, fixed_settings, (replace(first_candidate, fit=analysis.fits[0]),)
         )
-        earlier_set = replace(candidate_set, candidates=tuple(earlier_candidates))
-        refitted = (
-            earlier_set._refit_in(candidate_set, c, DESCENT_EVALUATIONS) for c in other_candidates
+        earlier_candidate_set = replace(candidate_set, candidates=tuple(earlier_candidates))
+        refitted_candidates = (
+            earlier_candidate_set._refit_candidate_in(candidate_set, c, DESCENT_EVALUATIONS)
+            for c in other_candidates
         )
         candidate_set = (
-            candidate_set.with_candidates((*candidate_set.candidates, *refitted))
+            candidate_set.with_candidates((*candidate_set.candidates, *refitted_candidates))
             ._exclude_leakage()
             .cross_check()
         )
@@ -174,7 +176,7 @@ class CandidateSet:
     def fit_freest_structure(
         cls,
         measurement: Measurement,
-        fixed: tuple[Setting, ...],
+        fixed_settings: tuple[Setting, ...],
         band_hz: tuple[float, float],
         additional_structures: tuple[Structure, ...] = (),
     ) -> CandidateSet:
@@ -184,31 +186,35 @@ class CandidateSet:
         """
         structures = (_FREEST_STRUCTURE, *additional_structures)
         return cls._from_uniform_beam(
-            fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
+            fit_record(measurement, structures, fixed=fixed_settings, band_hz=band_hz),
+            fixed_settings,
         )
 
     @classmethod
     def _from_uniform_beam(
-        cls, uniform_analysis: RecordAnalysis, fixed: tuple[Setting, ...]
+        cls, uniform_analysis: RecordAnalysis, fixed_settings: tuple[Setting, ...]
     ) -> CandidateSet:
         """Return the candidate set of an analysis that fitted structures on a uniform beam."""
         return cls._from_analysis(
             uniform_analysis,
-            fixed,
+            fixed_settings,
             (Candidate(fit.structure, fit) for fit in uniform_analysis.fits),
         )
 
     @classmethod
     def _from_analysis(
-        cls, analysis: RecordAnalysis, fixed: tuple[Setting, ...], candidates: Iterable[Candidate]
+        cls,
+        analysis: RecordAnalysis,
+        fixed_settings: tuple[Setting, ...],
+        candidates: Iterable[Candidate],
     ) -> CandidateSet:
         """Return a set of given candidates, with the record and noise of an analysis."""
         comparison = analysis.comparison
         return cls(
             comparison=comparison,
             noise=analysis.noise,
-            free_settings=free_settings(fixed),
-            candidates=_by_rising_bic(candidates),
+            free_settings=free_settings(fixed_settings),
+            candidates=_sorted_by_bic(candidates),
             effect_spectra=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
         )
 
@@ -230,17 +236,22 @@ class CandidateSet:
         if its structure is true. If no structure was fitted with free orders, return the best
         candidate.
         """
-        by_structure = {c.structure.name: c for c in self.candidates}
-        freest_candidate = by_structure.get(_FREEST_STRUCTURE.name)
+        candidates_by_structure = {c.structure.name: c for c in self.candidates}
+        freest_candidate = candidates_by_structure.get(_FREEST_STRUCTURE.name)
         if freest_candidate is None:
             return self.best
-        one_damping = [
-            by_structure[s.name] for s in _ONE_DAMPING_STRUCTURES if s.name in by_structure
+        single_damping_candidates = [
+            candidates_by_structure[s.name]
+            for s in _SINGLE_DAMPING_STRUCTURES
+            if s.name in candidates_by_structure
         ]
-        best_one_damping = min(one_damping, key=lambda c: c.deviance, default=freest_candidate)
+        best_single_damping_candidate = min(
+            single_damping_candidates, key=lambda c: c.deviance, default=freest_candidate
+        )
         return (
-            best_one_damping
-            if best_one_damping.deviance - freest_candidate.deviance < _MIN_DEVIANCE_OF_DAMPING
+            best_single_damping_candidate
+            if best_single_damping_candidate.deviance - freest_candidate.deviance
+            < _MIN_DEVIANCE_OF_DAMPING
             else freest_candidate
         )
 
@@ -281,16 +292,16 @@ class CandidateSet:
         The damping `structure` determines which parameters are free.
         """
         unknowns = self.unknowns(structure)
-        return self.descent(unknowns, unknowns.vector(plant), max_evaluations)
+        return self.descend_from_vector(unknowns, unknowns.vector(plant), max_evaluations)
 
-    def descent(
-        self, unknowns: Unknowns, start_point: NDArray[np.float64], max_evaluations: int
+    def descend_from_vector(
+        self, unknowns: Unknowns, start_vector: NDArray[np.float64], max_evaluations: int
     ) -> Refit:
         """Return the minimum of the cost that a descent reaches from a vector of unknowns."""
         return Refit.descend(
             self.comparison,
             unknowns,
-            start_point,
+            start_vector,
             self.noise,
             self.effect_spectra,
             max_evaluations=max_evaluations,
@@ -303,17 +314,24 @@ class CandidateSet:
         """
         candidate_set = self
         for _ in range(MAX_ANGLE_REESTIMATES):
-            best = candidate_set.best
+            best_candidate = candidate_set.best
             comparison = candidate_set.comparison.with_reestimated_angle(
-                best.fit.plant, candidate_set.noise
+                best_candidate.fit.plant, candidate_set.noise
             )
             if comparison is candidate_set.comparison:
                 break
-            set_of_best = replace(candidate_set, comparison=comparison, candidates=(best,))
-            noise = set_of_best.refit(best, REFIT_EVALUATIONS).residual_noise()
-            set_of_best = replace(set_of_best, noise=noise)
+            set_with_best_candidate = replace(
+                candidate_set, comparison=comparison, candidates=(best_candidate,)
+            )
+            noise = set_with_best_candidate.refit(
+                best_candidate, REFIT_EVALUATIONS
+            ).residual_noise()
+            set_with_best_candidate = replace(set_with_best_candidate, noise=noise)
             candidate_set = replace(
-                set_of_best, candidates=(set_of_best.refit(best, REFIT_EVALUATIONS).candidate(),)
+                set_with_best_candidate,
+                candidates=(
+                    set_with_best_candidate.refit(best_candidate, REFIT_EVALUATIONS).candidate(),
+                ),
             )
         if candidate_set is self:
             return self
@@ -321,11 +339,13 @@ class CandidateSet:
         other_candidates = (
             candidate for candidate in self.candidates if candidate is not self.best
         )
-        refitted = (
-            self._refit_in(candidate_set, candidate, DESCENT_EVALUATIONS)
+        refitted_candidates = (
+            self._refit_candidate_in(candidate_set, candidate, DESCENT_EVALUATIONS)
             for candidate in other_candidates
         )
-        return candidate_set.with_candidates((*candidate_set.candidates, *refitted)).cross_check()
+        return candidate_set.with_candidates(
+            (*candidate_set.candidates, *refitted_candidates)
+        ).cross_check()
 
     def _exclude_leakage(self) -> CandidateSet:
         """Refit all candidates without the bins into which a disturbance outside the band leaks."""
@@ -334,13 +354,14 @@ class CandidateSet:
 
     def refit_under_noise(self, noise: NoiseSpectrum) -> CandidateSet:
         """Return the set with all candidates refitted under a slightly different noise spectrum."""
-        new_set = replace(self, noise=noise)
-        return new_set.with_candidates(
-            self._refit_in(new_set, c, REFIT_EVALUATIONS) for c in self.candidates
+        new_candidate_set = replace(self, noise=noise)
+        return new_candidate_set.with_candidates(
+            self._refit_candidate_in(new_candidate_set, c, REFIT_EVALUATIONS)
+            for c in self.candidates
         )
 
-    def _refit_in(
-        self, new_set: CandidateSet, candidate: Candidate, max_evaluations: int
+    def _refit_candidate_in(
+        self, new_candidate_set: CandidateSet, candidate: Candidate, max_evaluations: int
     ) -> Candidate:
         """Return a candidate refitted with the record, noise and effects of another set.
 
@@ -349,11 +370,9 @@ class CandidateSet:
         bic_difference = candidate.bic - min(
             candidate_of_set.bic for candidate_of_set in self.candidates
         )
-        return new_set.refit(
+        return new_candidate_set.refit(
             candidate,
-            max_evaluations
-            if bic_difference < FAR_BEHIND_BIC_DIFFERENCE
-            else _ROUGH_FIT_EVALUATIONS,
+            max_evaluations if bic_difference < HOPELESS_BIC_DIFFERENCE else _ROUGH_FIT_EVALUATIONS,
         ).candidate()
 
     def cross_check(self) -> CandidateSet:
@@ -363,12 +382,14 @@ class CandidateSet:
         """
         candidate_set = self
         for _ in range(_MAX_CROSS_CHECK_ROUNDS):
-            best = candidate_set.best
+            best_candidate = candidate_set.best
             candidate_set = candidate_set.with_candidates(
-                c if c is best else candidate_set._refit_from_plant(c, best.fit.plant)
+                c
+                if c is best_candidate
+                else candidate_set._refit_from_plant(c, best_candidate.fit.plant)
                 for c in candidate_set.candidates
             )
-            if candidate_set.best is best:
+            if candidate_set.best is best_candidate:
                 break
         return candidate_set
 
@@ -413,7 +434,7 @@ class CandidateSet:
         )
         low_alpha, high_alpha = fit.interval["alpha"] or (math.inf, -math.inf)
         special_cases = [_INTEGER_ORDER_STRUCTURE] if not low_alpha <= 1 <= high_alpha else []
-        special_cases += _one_damping_structures(fit)
+        special_cases += _single_damping_structures(fit)
         fitted_candidates = (
             self.descend_from_plant(fit.plant, structure).candidate() for structure in special_cases
         )
@@ -448,33 +469,33 @@ class CandidateSet:
             if structure.has_damping_of(parameter_name)
         }
         fixed_values[order] = 1.0
-        both_dampings = replace(structure, fixed=fixed_values)
-        unknowns = self.unknowns(both_dampings)
+        structure_with_both_dampings = replace(structure, fixed=fixed_values)
+        unknowns = self.unknowns(structure_with_both_dampings)
         coefficient_index = unknowns.names.index(coefficient)
-        start_point = self.descent(unknowns, unknowns.vector(own_fit.plant), 1)
+        start_refit = self.descend_from_vector(unknowns, unknowns.vector(own_fit.plant), 1)
         # The predicted step of the logarithm is taken as linear in the coefficient itself.
-        coefficient_growth = 1 + float(start_point.predicted_step[coefficient_index])
-        if coefficient_growth > 1:
-            start_vector = start_point.x.copy()
-            start_vector[coefficient_index] += math.log(coefficient_growth)
-            minimum = self.descent(unknowns, start_vector, DESCENT_EVALUATIONS)
-            if minimum.x[coefficient_index] > start_point.x[coefficient_index]:
-                return minimum.fit(), False
-        scaled_hessian, unknown_scale = start_point.equations.scaled_hessian()
+        predicted_growth_factor = 1 + float(start_refit.predicted_step[coefficient_index])
+        if predicted_growth_factor > 1:
+            start_vector = start_refit.x.copy()
+            start_vector[coefficient_index] += math.log(predicted_growth_factor)
+            refit_at_minimum = self.descend_from_vector(unknowns, start_vector, DESCENT_EVALUATIONS)
+            if refit_at_minimum.x[coefficient_index] > start_refit.x[coefficient_index]:
+                return refit_at_minimum.fit(), False
+        scaled_hessian, unknown_scale = start_refit.equations.scaled_hessian()
         scaled_std = (
             np.linalg.inv(scaled_hessian + 1e-12 * np.eye(unknown_scale.size))[
                 coefficient_index, coefficient_index
             ]
             ** 0.5
         )
-        x = start_point.x.copy()
+        x = start_refit.x.copy()
         x[coefficient_index] += max(math.log(scaled_std / unknown_scale[coefficient_index]), 0.0)
-        return self.descent(unknowns, x, 1).fit(), True
+        return self.descend_from_vector(unknowns, x, 1).fit(), True
 
     def fit_with_free_orders(self) -> CandidateSet:
         """Return the set with the structures of free damping orders fitted, if they are missing."""
         best_candidate = self.best
-        by_structure = {c.structure.name: c.fit for c in self.candidates}
+        fits_by_structure = {c.structure.name: c.fit for c in self.candidates}
         refits: list[Refit] = []
         added_candidates: list[Candidate] = []
 
@@ -483,16 +504,20 @@ class CandidateSet:
             added_candidates.append(refits[-1].candidate())
             return added_candidates[-1].fit
 
-        freest_fit = by_structure.get(_FREEST_STRUCTURE.name) or fit_structure(_FREEST_STRUCTURE)
-        for structure in _one_damping_structures(freest_fit):
-            if structure.name not in by_structure:
+        freest_fit = fits_by_structure.get(_FREEST_STRUCTURE.name) or fit_structure(
+            _FREEST_STRUCTURE
+        )
+        for structure in _single_damping_structures(freest_fit):
+            if structure.name not in fits_by_structure:
                 fit_structure(structure)
         if not refits:
             return self
-        new_set = self.with_candidates((*self.candidates, *added_candidates))
-        if new_set.best.bic > best_candidate.bic - _MIN_BIC_REDUCTION_FOR_NEW_NOISE:
-            return new_set.cross_check()
-        return new_set.refit_under_noise(min(refits, key=lambda refit: refit.cost).residual_noise())
+        new_candidate_set = self.with_candidates((*self.candidates, *added_candidates))
+        if new_candidate_set.best.bic > best_candidate.bic - _MIN_BIC_REDUCTION_FOR_NEW_NOISE:
+            return new_candidate_set.cross_check()
+        return new_candidate_set.refit_under_noise(
+            min(refits, key=lambda refit: refit.cost).residual_noise()
+        )
 
     def refit_with_additional_effect(self, effect_spectra: NDArray[np.complex128]) -> CandidateSet:
         """Return the set refitted with additional torque spectra, each of free amplitude.
@@ -511,34 +536,36 @@ class CandidateSet:
         The spectra are those of effects in addition to the linear beam. They replace the
         `effect_spectra` of the set.
         """
-        new_set = replace(self, effect_spectra=effect_spectra, noise=noise)
-        return new_set.with_candidates(
-            new_set.refit(c).candidate() for c in self.candidates
+        new_candidate_set = replace(self, effect_spectra=effect_spectra, noise=noise)
+        return new_candidate_set.with_candidates(
+            new_candidate_set.refit(c).candidate() for c in self.candidates
         ).cross_check()
 
     def with_candidates(self, candidates: Iterable[Candidate]) -> CandidateSet:
         """Return the set with its candidates replaced by the given ones, sorted by rising BIC."""
-        return replace(self, candidates=_by_rising_bic(candidates))
+        return replace(self, candidates=_sorted_by_bic(candidates))
 
     def is_nearly_white(self, fit: RecordFit) -> bool:
         """Return whether the torque residual of a fit is white noise at the 1 % level."""
-        used_bins = self.noise.is_compared
+        is_compared = self.noise.is_compared
         return whiteness(
-            fit.residual[used_bins], self.comparison.frequency_hz[used_bins]
+            fit.residual[is_compared], self.comparison.frequency_hz[is_compared]
         ).is_nearly_white
 
 
-def _one_damping_structures(fit: RecordFit) -> list[Structure]:
+def _single_damping_structures(fit: RecordFit) -> list[Structure]:
     """Return the structures of one damping, if the other damping is insignificant in a fit."""
-    structures_and_missing = zip(_ONE_DAMPING_STRUCTURES, (fit.external, fit.internal), strict=True)
+    structures_with_absent_dampings = zip(
+        _SINGLE_DAMPING_STRUCTURES, (fit.external, fit.internal), strict=True
+    )
     return [
         structure
-        for structure, missing_damping in structures_and_missing
+        for structure, missing_damping in structures_with_absent_dampings
         if missing_damping is None
-        or missing_damping.value < _CERTAIN_COEFFICIENT_OVER_STD * missing_damping.std
+        or missing_damping.value < _CERTAIN_DAMPING_STD_RATIO * missing_damping.std
     ]
 
 
-def _by_rising_bic(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+def _sorted_by_bic(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
     """Return the candidates sorted by rising BIC."""
     return tuple(sorted(candidates, key=lambda candidate: candidate.bic))

@@ -14,13 +14,13 @@ from analysis.identify._altered_beam import GRAVITY_M_S2
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from analysis.identify._altered_beam import Alteration, Profile
+    from analysis.identify._altered_beam import BeamDeviations, DeviationProfile
     from rigd.beam import Beam, Plant
 
-_BUTTERWORTH_LOSS: Final = 2**0.5
+_BUTTERWORTH_INVERSE_QUALITY: Final = 2**0.5
 """Reciprocal quality factor of a second-order Butterworth filter."""
 
-RELAXATION: Final = "relaxation"
+RELAXATION_CAUSE: Final = "relaxation"
 """Name of the cause that may explain all of the internal damping."""
 
 
@@ -34,35 +34,37 @@ class Cause:
     ----------
     name : str
         Name of the cause.
-    starts : sequence of tuple of float
+    start_points : sequence of tuple of float
         Unknowns from which searches begin.
-    lower, upper : tuple of float
+    lower_bounds, upper_bounds : tuple of float
         Plausible range of the unknowns; a fit that ends at a bound is discarded.
-    alter : callable
-        Function of the alteration that the file states, the unknowns and the beam. It returns the
-        alteration with this cause added.
+    add_deviation : callable
+        Function of the deviations that the file states, the unknowns and the beam. It returns the
+        deviations with this cause added.
     describe : callable
         Function of the unknowns and the fitted beam. It returns size, unit and a phrase.
     plant : callable, optional
         Function of the unknowns and the fitted plant. It returns the plant with this cause.
-    special_cases : tuple of str
+    special_case_names : tuple of str
         Names of causes that this one includes as special cases.
     """
 
     name: str
-    starts: Sequence[tuple[float, ...]]
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
-    alter: Callable[[Alteration, Sequence[float], Beam], Alteration]
+    start_points: Sequence[tuple[float, ...]]
+    lower_bounds: tuple[float, ...]
+    upper_bounds: tuple[float, ...]
+    add_deviation: Callable[[BeamDeviations, Sequence[float], Beam], BeamDeviations]
     describe: Callable[[Sequence[float], Beam], tuple[float, str, str]]
     plant: Callable[[Sequence[float], Plant], Plant | None] | None = None
-    special_cases: tuple[str, ...] = ()
+    special_case_names: tuple[str, ...] = ()
 
 
-def _set_tilt(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
-    """Return an alteration with gravity for a tilted axis; the unknown is the tilt in degrees."""
+def _set_tilt(
+    stated_deviations: BeamDeviations, unknowns: Sequence[float], _: Beam
+) -> BeamDeviations:
+    """Return beam deviations with gravity for a tilted axis; the unknown is the tilt in degrees."""
     return replace(
-        stated_alteration, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(unknowns[0]))
+        stated_deviations, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(unknowns[0]))
     )
 
 
@@ -76,16 +78,16 @@ def _describe_tilt(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]
     return unknowns[0], "deg", phrase
 
 
-def _added_mass_kg(fraction: float, beam: Beam) -> float:
+def _added_mass_kg(mass_fraction: float, beam: Beam) -> float:
     """Return a mass in kilograms that is a given fraction of the beam's mass."""
-    return fraction * beam.density_kg_per_m * beam.length_m
+    return mass_fraction * beam.density_kg_per_m * beam.length_m
 
 
 def _set_tip_mass(
-    stated_alteration: Alteration, unknowns: Sequence[float], beam: Beam
-) -> Alteration:
-    """Return a beam alteration with a tip mass; the unknown is its fraction of the beam's mass."""
-    return replace(stated_alteration, lumps=((1.0, _added_mass_kg(unknowns[0], beam)),))
+    stated_deviations: BeamDeviations, unknowns: Sequence[float], beam: Beam
+) -> BeamDeviations:
+    """Return beam deviations with a tip mass; the unknown is its fraction of the beam's mass."""
+    return replace(stated_deviations, point_masses=((1.0, _added_mass_kg(unknowns[0], beam)),))
 
 
 def _describe_tip_mass(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
@@ -94,18 +96,23 @@ def _describe_tip_mass(unknowns: Sequence[float], beam: Beam) -> tuple[float, st
     return mass_kg, "kg", f"a mass of {_format_two_digits(1e3 * mass_kg)} g at the tip"
 
 
-def _add_lump(stated_alteration: Alteration, unknowns: Sequence[float], beam: Beam) -> Alteration:
-    """Return a beam alteration with a further point mass.
+def _add_point_mass(
+    stated_deviations: BeamDeviations, unknowns: Sequence[float], beam: Beam
+) -> BeamDeviations:
+    """Return beam deviations with a further point mass.
 
     The unknowns are its position relative to the length and its fraction of the beam's mass.
     """
     return replace(
-        stated_alteration,
-        lumps=(*stated_alteration.lumps, (unknowns[0], _added_mass_kg(unknowns[1], beam))),
+        stated_deviations,
+        point_masses=(
+            *stated_deviations.point_masses,
+            (unknowns[0], _added_mass_kg(unknowns[1], beam)),
+        ),
     )
 
 
-def _describe_lump(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
+def _describe_point_mass(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
     """Describe a point mass on the beam: size in kilograms, unit and phrase."""
     mass_kg = _added_mass_kg(unknowns[1], beam)
     position_phrase = f"{100 * unknowns[0]:.0f} % of the length"
@@ -122,14 +129,14 @@ def _compliance_rad_per_nm(unknowns: Sequence[float], beam: Beam) -> float:
 
 
 def _set_clamp_compliance(
-    stated_alteration: Alteration, unknowns: Sequence[float], _: Beam
-) -> Alteration:
-    """Return a beam alteration with a compliant clamp; unknowns are compliance and loss factor.
+    stated_deviations: BeamDeviations, unknowns: Sequence[float], _: Beam
+) -> BeamDeviations:
+    """Return beam deviations with a compliant clamp; unknowns are compliance and loss factor.
 
     The compliance is relative to that of the beam, L/EI.
     """
     return replace(
-        stated_alteration,
+        stated_deviations,
         clamp_compliance=unknowns[0],
         clamp_loss=unknowns[1] if len(unknowns) > 1 else 0.0,
     )
@@ -151,21 +158,23 @@ def _describe_clamp(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, 
 
 def _describe_first_order_filter(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
     """Describe a first-order filter of the torque channel: corner in Hz, unit and phrase."""
-    hz = _filter_frequency_hz(unknowns)
+    corner_hz = _filter_frequency_hz(unknowns)
     return (
-        hz,
+        corner_hz,
         "Hz",
-        f"a low-pass filter of first order at {_format_two_digits(hz)} Hz in the torque channel",
+        f"a low-pass filter of first order at {_format_two_digits(corner_hz)} Hz "
+        "in the torque channel",
     )
 
 
 def _describe_second_order_filter(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
     """Describe a second-order filter of the torque channel: corner in Hz, unit and phrase."""
-    hz = _filter_frequency_hz(unknowns)
+    corner_hz = _filter_frequency_hz(unknowns)
     return (
-        hz,
+        corner_hz,
         "Hz",
-        f"a low-pass filter of second order at {_format_two_digits(hz)} Hz in the torque channel",
+        f"a low-pass filter of second order at {_format_two_digits(corner_hz)} Hz "
+        "in the torque channel",
     )
 
 
@@ -191,8 +200,12 @@ def _plant_with_second_order_filter(unknowns: Sequence[float], plant: Plant) -> 
 
 def _describe_resonance(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
     """Describe a resonance of the torque sensor: frequency in Hz, unit and phrase."""
-    hz = _filter_frequency_hz(unknowns)
-    return hz, "Hz", f"a resonance of sensor or mount near {_format_two_digits(hz)} Hz"
+    resonance_hz = _filter_frequency_hz(unknowns)
+    return (
+        resonance_hz,
+        "Hz",
+        f"a resonance of sensor or mount near {_format_two_digits(resonance_hz)} Hz",
+    )
 
 
 def _filter_frequency_hz(unknowns: Sequence[float]) -> float:
@@ -215,29 +228,38 @@ def _format_two_digits(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 100 else f"{float(f'{value:.2g}'):.0f}"
 
 
-def _uneven_mass_cause(profile: Profile, phrase: str) -> Cause:
+def _uneven_mass_cause(profile: DeviationProfile, phrase: str) -> Cause:
     """Return the cause that the mass per length deviates with a profile along the beam."""
 
-    def alter(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
-        return replace(stated_alteration, density=((profile, unknowns[0]),))
+    def add_deviation(
+        stated_deviations: BeamDeviations, unknowns: Sequence[float], _: Beam
+    ) -> BeamDeviations:
+        return replace(stated_deviations, density_deviations=((profile, unknowns[0]),))
 
     return Cause(
-        "uneven mass", _STARTS_OF_EITHER_SIGN, (-0.3,), (0.3,), alter, _describe_deviation(phrase)
+        "uneven mass",
+        _START_POINTS_OF_BOTH_SIGNS,
+        (-0.3,),
+        (0.3,),
+        add_deviation,
+        _describe_deviation(phrase),
     )
 
 
-def _uneven_stiffness_cause(profile: Profile, phrase: str) -> Cause:
+def _uneven_stiffness_cause(profile: DeviationProfile, phrase: str) -> Cause:
     """Return the cause that the bending stiffness deviates with a profile along the beam."""
 
-    def alter(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
-        return replace(stated_alteration, stiffness=((profile, unknowns[0]),))
+    def add_deviation(
+        stated_deviations: BeamDeviations, unknowns: Sequence[float], _: Beam
+    ) -> BeamDeviations:
+        return replace(stated_deviations, stiffness_deviations=((profile, unknowns[0]),))
 
     return Cause(
         "uneven stiffness",
-        _STARTS_OF_EITHER_SIGN,
+        _START_POINTS_OF_BOTH_SIGNS,
         (-0.3,),
         (0.3,),
-        alter,
+        add_deviation,
         _describe_deviation(phrase),
     )
 
@@ -254,7 +276,7 @@ def _describe_deviation(phrase: str) -> Callable[[Sequence[float], Beam], tuple[
     )
 
 
-_STARTS_OF_EITHER_SIGN: Final = ((-0.01,), (0.01,))
+_START_POINTS_OF_BOTH_SIGNS: Final = ((-0.01,), (0.01,))
 """Start values of a relative deviation of either sign."""
 
 CAUSES: Final = (
@@ -273,9 +295,9 @@ CAUSES: Final = (
         tuple((0.05 * index, 0.01) for index in range(3, 20, 2)),
         (0.02, 0.0),
         (0.99, 0.5),
-        _add_lump,
-        _describe_lump,
-        special_cases=("tip mass",),
+        _add_point_mass,
+        _describe_point_mass,
+        special_case_names=("tip mass",),
     ),
     _uneven_mass_cause("taper", "a mass per length that changes by {} from root to tip"),
     _uneven_mass_cause("outer half", "an outer half with {} mass per length"),
@@ -305,14 +327,16 @@ CAUSES: Final = (
         (0.2, 0.5),
         _set_clamp_compliance,
         _describe_clamp,
-        special_cases=("elastic clamp",),
+        special_case_names=("elastic clamp",),
     ),
     Cause(
         "torque filter of first order",
         ((0.2,), (0.6,), (2.0,)),
         (0.0,),
         (20.0,),
-        lambda stated_alteration, unknowns, _: replace(stated_alteration, lag_s=1e-3 * unknowns[0]),
+        lambda stated_deviations, unknowns, _: replace(
+            stated_deviations, first_order_torque_lag_s=1e-3 * unknowns[0]
+        ),
         _describe_first_order_filter,
         _plant_with_first_order_filter,
     ),
@@ -321,8 +345,9 @@ CAUSES: Final = (
         ((0.2,), (0.6,), (2.0,)),
         (0.0,),
         (10.0,),
-        lambda stated_alteration, unknowns, _: replace(
-            stated_alteration, sensor_lag=(1e-3 * unknowns[0], _BUTTERWORTH_LOSS)
+        lambda stated_deviations, unknowns, _: replace(
+            stated_deviations,
+            second_order_torque_lag=(1e-3 * unknowns[0], _BUTTERWORTH_INVERSE_QUALITY),
         ),
         _describe_second_order_filter,
         _plant_with_second_order_filter,
@@ -332,14 +357,14 @@ CAUSES: Final = (
         tuple((size, loss) for size in (0.3, 0.6, 1.0, 1.6) for loss in (0.05, 0.5)),
         (0.0, 0.0),
         (3.0, 2.0),
-        lambda stated_alteration, unknowns, _: replace(
-            stated_alteration, sensor_lag=(1e-3 * unknowns[0], unknowns[1])
+        lambda stated_deviations, unknowns, _: replace(
+            stated_deviations, second_order_torque_lag=(1e-3 * unknowns[0], unknowns[1])
         ),
         _describe_resonance,
-        special_cases=("torque filter of second order",),
+        special_case_names=("torque filter of second order",),
     ),
     Cause(
-        RELAXATION,
+        RELAXATION_CAUSE,
         tuple(
             (math.log(time_s), strength)
             for time_s in (5e-4, 2e-3, 8e-3, 0.03, 0.1, 0.3)
@@ -347,8 +372,8 @@ CAUSES: Final = (
         ),
         (math.log(1e-4), 0.0),
         (math.log(3.0), 0.5),
-        lambda stated_alteration, unknowns, _: replace(
-            stated_alteration, relaxation=(unknowns[1], math.exp(unknowns[0]))
+        lambda stated_deviations, unknowns, _: replace(
+            stated_deviations, relaxation_strength_and_time=(unknowns[1], math.exp(unknowns[0]))
         ),
         _describe_relaxation,
     ),

@@ -470,17 +470,17 @@ def _drag_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
         return
     interval_low_m, interval_high_m = drag.interval_95_m
     (rounded_sizes,) = rounded_to_uncertainty(
-        (drag.value_m,), (interval_high_m - interval_low_m) / 2, 1e3
+        (drag.drag_m,), (interval_high_m - interval_low_m) / 2, 1e3
     )
     yield Finding(
         kind="air drag",
         sentence=(
             f"Air drag acts on the beam: C_D d = {rounded_sizes} mm "
-            f"({interval_text(drag.interval_95_m, 1e3)} mm; 95 %) at {drag.speed_m_s:.2g} "
+            f"({interval_text(drag.interval_95_m, 1e3)} mm; 95 %) at {drag.pivot_speed_m_s:.2g} "
             "m/s, so damping grows with the amplitude. Drag was fitted too; the beam's parameters "
             "are those without air."
         ),
-        value=drag.value_m,
+        value=drag.drag_m,
         interval=drag.interval_95_m,
         unit="m",
         remedy="Sweep at a quarter of the amplitude, where drag is negligible, or in vacuum.",

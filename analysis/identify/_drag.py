@@ -157,7 +157,7 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
     assert set_with_drag.drag is not None
     return (
         set_with_drag
-        if set_with_drag.drag.value_m > 0 and set_with_drag.bic < candidate_set.bic
+        if set_with_drag.drag.drag_m > 0 and set_with_drag.bic < candidate_set.bic
         else candidate_set
     )
 
@@ -202,10 +202,12 @@ def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
         drag_m, cost_reduction = _first_order_drag(refit)
         cost_without_drag = refit.cost
         cost_with_drag = max(cost_without_drag - cost_reduction, 1e-3 * cost_without_drag)
-        deviance_reduction = candidate.values * math.log(cost_without_drag / cost_with_drag)
+        deviance_reduction = candidate.compared_value_count * math.log(
+            cost_without_drag / cost_with_drag
+        )
         if (
             drag_m > 0
-            and candidate.bic - deviance_reduction + math.log(candidate.values)
+            and candidate.bic - deviance_reduction + math.log(candidate.compared_value_count)
             < best_candidate.bic + _FIRST_ORDER_BIC_MARGIN
         ):
             return True
@@ -357,10 +359,12 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
         effect_spectra=converged_fit.effect_spectra,
         noise=converged_fit.residual_noise(),
     )
-    converged_cost = set_with_drag.descent(
+    converged_cost = set_with_drag.descend_from_vector(
         converged_fit.objective.unknowns, converged_fit.x, 1
     ).cost
-    cost_limit = converged_cost * math.exp(_GIVE_UP_DEVIANCE / candidate_set.best.values)
+    cost_limit = converged_cost * math.exp(
+        _GIVE_UP_DEVIANCE / candidate_set.best.compared_value_count
+    )
     short_descents = []
     for candidate_without in candidate_set.candidates:
         unknowns = set_with_drag.unknowns(candidate_without.structure)
@@ -407,10 +411,10 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
         law_weights = np.array([1.0, speed_m_s ** (-2 / 3)])
     drag_m, std = law.at(speed_m_s), math.sqrt(float(law_weights @ covariance @ law_weights))
     return DragEstimate(
-        value_m=drag_m,
+        drag_m=drag_m,
         std_m=std,
         interval_95_m=(max(drag_m - NORMAL_95 * std, 0.0), drag_m + NORMAL_95 * std),
-        speed_m_s=speed_m_s,
+        pivot_speed_m_s=speed_m_s,
         law=law,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
     )

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
-from analysis.identify._causes import CAUSES, RELAXATION
+from analysis.identify._altered_beam import BeamDeviations, galerkin_mode_terms
+from analysis.identify._causes import CAUSES, RELAXATION_CAUSE
 from analysis.identify._finding import Finding
 from analysis.identify.beam_uniformity import MIN_P_VALUE_OF_UNIFORM_BEAM
 from analysis.identify.uniform_beam import UniformBeamProblem
@@ -135,7 +135,7 @@ def explanations(test: UniformBeamTest) -> tuple[CauseFit, ...]:
     for cause in CAUSES:
         start_beams = (
             (best_beam, middle_start, without_internal)
-            if cause.name == RELAXATION
+            if cause.name == RELAXATION_CAUSE
             else (best_beam, middle_start)
         )
         cause_fit = _fit_cause(problem, cause, start_beams)
@@ -144,7 +144,7 @@ def explanations(test: UniformBeamTest) -> tuple[CauseFit, ...]:
         # Of each name only the best fit, and no general cause if a special case suffices.
         rival_chi_squares = [
             explained_by[cause_name].chi_square
-            for cause_name in cause.special_cases
+            for cause_name in cause.special_case_names
             if cause_name in explained_by
         ]
         required_reduction = _NAMED_CHI_SQUARE_MARGIN
@@ -177,7 +177,7 @@ def _fit_cause(
     plausible range does not count as an explanation.
     """
     beam_unknowns = problem.lower.size
-    degrees_of_freedom = problem.constant_count - beam_unknowns - len(cause.lower)
+    degrees_of_freedom = problem.constant_count - beam_unknowns - len(cause.lower_bounds)
     if degrees_of_freedom <= 0:
         return None
     starts = [(*_CauseSearch(problem, cause, x).best_start(), x) for x in start_beams]
@@ -191,7 +191,7 @@ def _fit_cause(
     else:
         return None
     cause_unknowns = y[beam_unknowns:]
-    at_bound = (cause_unknowns <= cause.lower) | (cause_unknowns >= cause.upper)
+    at_bound = (cause_unknowns <= cause.lower_bounds) | (cause_unknowns >= cause.upper_bounds)
     at_bound[1:] &= cause_unknowns[1:] != 0  # a loss factor of 0 is allowed
     if at_bound.any():
         return None
@@ -244,10 +244,10 @@ class _CauseSearch:
         tolerance: float = _CONSTANT_TOLERANCES[0],
     ) -> None:
         self._problem, self._cause, self._beam_x = problem, cause, x
-        self._lower = np.concatenate([problem.lower, cause.lower])
+        self._lower = np.concatenate([problem.lower, cause.lower_bounds])
         upper = np.where(x <= problem.lower, problem.lower, problem.upper)
-        self._upper = np.concatenate([upper, cause.upper])
-        cause_scale = np.max(np.abs([cause.lower, cause.upper]), axis=0)
+        self._upper = np.concatenate([upper, cause.upper_bounds])
+        cause_scale = np.max(np.abs([cause.lower_bounds, cause.upper_bounds]), axis=0)
         self._scale = np.concatenate([np.ones(x.size), cause_scale])
         covariance = problem.covariance + tolerance**2 * np.eye(problem.constant_count)
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -260,7 +260,7 @@ class _CauseSearch:
         x, derivatives = self._beam_x, None
         lowest_step, highest_step = (limits[: x.size] - x for limits in (self._lower, self._upper))
         stepped_starts = []
-        for cause_start in self._cause.starts:
+        for cause_start in self._cause.start_points:
             y = np.concatenate([x, cause_start])
             mode_terms = self._mode_terms(y)
             residual, slopes = self._residual_and_slopes(x, mode_terms)
@@ -313,14 +313,16 @@ class _CauseSearch:
         """Return the Galerkin coefficients of the modes for the unknowns of beam and cause."""
         x, cause_unknowns = y[: self._beam_x.size], y[self._beam_x.size :].tolist()
         beam = self._problem.plant(x).beam
-        alteration = self._cause.alter(self._problem.stated_alteration, cause_unknowns, beam)
-        if alteration.has_same_shapes(Alteration()):
-            return replace(self._problem.plain_terms, alteration=alteration)
+        alteration = self._cause.add_deviation(
+            self._problem.stated_alteration, cause_unknowns, beam
+        )
+        if alteration.has_same_mode_shapes(BeamDeviations()):
+            return replace(self._problem.plain_terms, deviations=alteration)
         terms = galerkin_mode_terms(alteration, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
         return (
             terms
-            if self._problem.stated_alteration.lumps
+            if self._problem.stated_alteration.point_masses
             else replace(terms, density_kg_per_m=None)
         )
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE
+from analysis.identify._candidate import HOPELESS_BIC_DIFFERENCE
 from analysis.identify._comparison import Comparison
 from analysis.identify._problem import Objective
 from analysis.identify._result import RecordAnalysis, RecordFit
@@ -208,7 +208,7 @@ def _descend_with_noise(
         .descend_to_minimum(noise_spectrum, _COST_TOLERANCE)
     )
     far_behind_ratio = math.exp(
-        FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.is_compared))
+        HOPELESS_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.is_compared))
     )
     cost_limit = far_behind_ratio * closest_descent.cost(noise_spectrum)
     structure_descents = []

@@ -96,7 +96,7 @@ class _Mode:
             self._stiffness, clamp, mass, lump, tension, mass_arm, lump_arm,
             self._medium_arm, tension_arm, arm_change_by_external, arm_change_by_internal,
         ) = coefficients  # fmt: skip
-        self._relaxation, self._lags = terms.alteration.relaxation, lags
+        self._relaxation, self._lags = terms.deviations.relaxation_strength_and_time, lags
         self._ratio = math.exp(ln_ratio)
         self._lump: complex = 0.0  # mass that does not change with the density
         self._lump_arm: complex = 0.0

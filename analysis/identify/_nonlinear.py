@@ -354,7 +354,7 @@ def _add_forces(
 
 def _deviance_reduction(candidate: Candidate, cost_before: float, cost_after: float) -> float:
     """Return by how much the deviance of a candidate falls from one cost to another."""
-    return candidate.values * math.log(cost_before / cost_after)
+    return candidate.compared_value_count * math.log(cost_before / cost_after)
 
 
 def _best_first_order_force(

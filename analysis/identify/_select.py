@@ -557,7 +557,7 @@ def _candidate_table(candidate_set: CandidateSet) -> tuple[CandidateRow, ...]:
     return tuple(
         CandidateRow(
             structure=c.structure.name,
-            parameters=c.parameters,
+            parameters=c.parameter_count,
             cost=c.fit.cost,
             delta_bic=c.bic - best_candidate.bic,
             delta_aic=c.aic - least_aic,

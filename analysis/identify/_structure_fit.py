@@ -130,7 +130,7 @@ def fit_structure(
     """
     structure, plugin = added_structure.structure, added_structure.plugin
     best = selection.candidates[0]
-    if best.effect_count or selection.analysis.comparison.drag is not None:
+    if best.nonlinear_effect_count or selection.analysis.comparison.drag is not None:
         return None
     noise = selection.analysis.noise
     comparison = selection.analysis.comparison
@@ -175,7 +175,7 @@ def fit_structure(
             )
         except ValueError as error:
             raise plugin.error(str(error)) from error
-    degrees_of_freedom = best.values - x.size - best.fit.ringing.degrees_of_freedom
+    degrees_of_freedom = best.compared_value_count - x.size - best.fit.ringing.degrees_of_freedom
     at_bound = (x <= region.lower) | (x >= region.upper)
     covariance, determined = covariance_of_unknowns(
         projected_residual.jacobian, projected_residual.cost / degrees_of_freedom, at_bound
@@ -199,7 +199,7 @@ def fit_structure(
         loss_factors=loss_factors,
         cost=minimum.cost,
         degrees_of_freedom=degrees_of_freedom,
-        delta_bic=bic(minimum.cost, best.values, x.size) - best.bic,
+        delta_bic=bic(minimum.cost, best.compared_value_count, x.size) - best.bic,
         compared_with=best.name,
         residual=projected_residual.residual,
     )

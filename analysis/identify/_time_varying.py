@@ -233,8 +233,10 @@ def _promising_changes(
         zip(effect_spectra, cost_reductions.tolist(), strict=True), key=lambda pair: -pair[1]
     ):
         remaining_cost = max(candidate_refit.cost - cost_reduction, 1e-3 * candidate_refit.cost)
-        deviance_reduction = candidate.values * math.log(candidate_refit.cost / remaining_cost)
-        bic = candidate.bic - deviance_reduction + math.log(candidate.values)
+        deviance_reduction = candidate.compared_value_count * math.log(
+            candidate_refit.cost / remaining_cost
+        )
+        bic = candidate.bic - deviance_reduction + math.log(candidate.compared_value_count)
         if deviance_reduction > _MIN_DEVIANCE_REDUCTION and bic < highest_bic:
             yield changing_property, bic
 
@@ -271,10 +273,17 @@ def _fit_with_change(
         is_converged = abs(change_size - previous_size) < _RELATIVE_SIZE_TOLERANCE * abs(
             change_size
         )
-        if is_converged and abs(candidate.values * math.log(cost_before / change_refit.cost)) < 1:
+        if (
+            is_converged
+            and abs(candidate.compared_value_count * math.log(cost_before / change_refit.cost)) < 1
+        ):
             break
-    refit_deviance = candidate.values * math.log(change_refit.cost / candidate.values)
-    return change_refit, refit_deviance + (candidate.parameters + 1) * math.log(candidate.values)
+    refit_deviance = candidate.compared_value_count * math.log(
+        change_refit.cost / candidate.compared_value_count
+    )
+    return change_refit, refit_deviance + (candidate.parameter_count + 1) * math.log(
+        candidate.compared_value_count
+    )
 
 
 def _torque_spectra(

@@ -313,7 +313,7 @@ def headline(
     if candidate_set.drag is not None:
         drag_estimate = candidate_set.drag
         reported_drag = Estimate(
-            drag_estimate.value_m,
+            drag_estimate.drag_m,
             drag_estimate.std_m,
             drag_estimate.interval_95_m,
             unexplained_reason,
@@ -326,7 +326,7 @@ def headline(
             reported_headline,
             parameters={**reported_headline.parameters, "drag": reported_drag},
             sizes=tuple(loss_factors),
-            drag_speed_m_s=drag_estimate.speed_m_s,
+            drag_speed_m_s=drag_estimate.pivot_speed_m_s,
         )
     conditional_estimate = (
         _conditional_estimate(candidate_set, fractional_orders)
@@ -464,7 +464,7 @@ def _structure_status(
         return "excluded" if has_less_likelihood and has_worse_bic else "compatible"
     if any(candidate.structure.fixed.get(order_name) == 1.0 for order_name in fractional_orders):
         return "excluded"
-    missing_parameters = freest_candidate.parameters - candidate.parameters
+    missing_parameters = freest_candidate.parameter_count - candidate.parameter_count
     deviance_limit = EXCLUSION_DEVIANCES[min(missing_parameters, len(EXCLUSION_DEVIANCES)) - 1]
     return (
         "excluded"
@@ -484,7 +484,7 @@ def _conditional_estimate(
     compatible_candidates = [
         candidate
         for candidate in candidate_set.candidates
-        if candidate.parameters < freest_candidate.parameters
+        if candidate.parameter_count < freest_candidate.parameter_count
         and _structure_status(candidate_set, candidate, fractional_orders) == "compatible"
     ]
     if not compatible_candidates:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE
+from analysis.identify._candidate import HOPELESS_BIC_DIFFERENCE
 from analysis.identify._refit import MISSED_COST_FRACTION, Refit
 from analysis.identify.deviance_curve import (
     CHI_SQUARE_95,
@@ -196,7 +196,8 @@ def profile(
             open_above=open_above,
             gain=0.0
             if order in candidate.structure.free
-            else candidate.values * math.log(max(candidate.fit.cost / lowest_cost, 1.0)),
+            else candidate.compared_value_count
+            * math.log(max(candidate.fit.cost / lowest_cost, 1.0)),
         ),
         structure=profiler.structure,
         plants=tuple(profiler.plant(order_value) for order_value in minimum_values),
@@ -358,10 +359,10 @@ class OrderProfiler:
     def __init__(self, candidate_set: CandidateSet, candidate: Candidate, order: OrderName) -> None:
         self.order = order
         self.structure = with_free_order(candidate.structure, order)
-        self._candidate_set, self._value_count = candidate_set, candidate.values
+        self._candidate_set, self._value_count = candidate_set, candidate.compared_value_count
         self._unknowns = unknowns = candidate_set.unknowns(self.structure)
         self._order_index = unknowns.names.index(order)
-        first_minimum = candidate_set.descent(
+        first_minimum = candidate_set.descend_from_vector(
             unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS
         )
         self.costs: dict[float, float] = {}
@@ -437,7 +438,7 @@ class OrderProfiler:
                 start_unknowns, _TRIAL_EVALUATIONS, held_unknowns=(self.order,)
             )
         highest_cost = min(self.costs.values()) * math.exp(
-            FAR_BEHIND_BIC_DIFFERENCE / self._value_count
+            HOPELESS_BIC_DIFFERENCE / self._value_count
         )
         for trial_order in coarse_minima_values(
             {trial_order: trial_fit.cost for trial_order, trial_fit in trial_fits.items()}
@@ -537,8 +538,7 @@ class OrderProfiler:
         """
         fixed_names, highest_cost = (
             (self.order,),
-            self.costs[self._minimum_order]
-            * math.exp(FAR_BEHIND_BIC_DIFFERENCE / self._value_count),
+            self.costs[self._minimum_order] * math.exp(HOPELESS_BIC_DIFFERENCE / self._value_count),
         )
         refit = self._descend(
             self._tangent(order_value, nearest_refit),

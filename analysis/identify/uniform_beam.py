@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
+from analysis.identify._altered_beam import BeamDeviations, galerkin_mode_terms
 from analysis.identify._modal_model import MODE_CONSTANT_NAMES
 from analysis.identify._mode_constants import BeamVibration
 from analysis.optimizer import ConstantBounds, NormalEquations, descend
@@ -132,14 +132,14 @@ class UniformBeamProblem:
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
         length_m = nominal.beam.length_m
         z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
-        self.stated_alteration = Alteration.from_nominal(nominal, tilt_deg)
+        self.stated_alteration = BeamDeviations.from_nominal_plant(nominal, tilt_deg)
         self.terms = galerkin_mode_terms(self.stated_alteration, nominal.beam, self.modes)
         constants_by_mode = self.measured.reshape(-1, len(MODE_CONSTANT_NAMES))
         self._omega_rad_s = 2 * np.pi * np.exp(constants_by_mode[:, 0])
         self._damping_ratios = np.exp(constants_by_mode[:, 1])
         self._measured_poles = (self._omega_rad_s * (1j - self._damping_ratios)).tolist()
         # The search starts at the mean of all modes.
-        modal_masses = self.terms.mass + self.terms.lump
+        modal_masses = self.terms.mass + self.terms.point_mass
         self._ln_density_over_stiffness = float(
             np.mean(np.log((z / length_m) ** 4 / modal_masses) - 2 * np.log(self._omega_rad_s))
         )
@@ -185,7 +185,7 @@ class UniformBeamProblem:
     @cached_property
     def plain_terms(self) -> ModeTerms:
         """Return the Galerkin coefficients of the uniform beam alone."""
-        return galerkin_mode_terms(Alteration(), self.nominal.beam, self.modes)
+        return galerkin_mode_terms(BeamDeviations(), self.nominal.beam, self.modes)
 
     def parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert unknowns, shape (..., 7), to the values of `PARAMETERS`.
@@ -231,7 +231,7 @@ class UniformBeamProblem:
             self.parameters(x).tolist(),
             terms,
             self.nominal.beam.length_m,
-            self.nominal.filter_denominators + terms.alteration.lags,
+            self.nominal.filter_denominators + terms.deviations.torque_lag_denominators,
             self._measured_poles,
         )
 
@@ -335,7 +335,7 @@ class UniformBeamProblem:
     def minima(self) -> list[Minimum]:
         """Minimize chi-square from all start vectors. Return the minima, the lowest first."""
         minima = self._minimize_from(self.starts())
-        for _ in range(_SHAPE_UPDATES if self.stated_alteration != Alteration() else 0):
+        for _ in range(_SHAPE_UPDATES if self.stated_alteration != BeamDeviations() else 0):
             self.terms = galerkin_mode_terms(
                 self.stated_alteration, self.plant(minima[0].x).beam, self.modes
             )

@@ -61,7 +61,7 @@ def test_drag_leaves_noise_only(uniform, refitted):
 
 def test_size_of_drag_is_right(refitted):
     drag = refitted.drag
-    assert abs(drag.value_m - DRAG_M) < 3 * drag.std_m
+    assert abs(drag.drag_m - DRAG_M) < 3 * drag.std_m
     assert drag.std_m < 0.04 * DRAG_M
 
 

@@ -11,7 +11,7 @@ import pytest
 from cauchy_residues import modal_constants
 
 from analysis.identify import ModalEstimate, ModalModel
-from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
+from analysis.identify._altered_beam import BeamDeviations, galerkin_mode_terms
 from analysis.identify._explanations import explanations, finding
 from analysis.identify._step_in_time import StiffnessStep
 from analysis.identify.beam_uniformity import uniform_beam_test
@@ -328,15 +328,15 @@ def test_losses_of_nonuniform_beam_have_a_tolerance():
     "altered",
     [
         {},
-        {"lumps": ((1.0, 2e-4),), "gravity_m_s2": 0.3},
-        {"clamp_compliance": 0.01, "clamp_loss": 0.1, "lag_s": 1e-4},
-        {"relaxation": (0.02, 0.01), "sensor_lag": (3e-4, 0.5)},
+        {"point_masses": ((1.0, 2e-4),), "gravity_m_s2": 0.3},
+        {"clamp_compliance": 0.01, "clamp_loss": 0.1, "first_order_torque_lag_s": 1e-4},
+        {"relaxation_strength_and_time": (0.02, 0.01), "second_order_torque_lag": (3e-4, 0.5)},
     ],
 )
 def test_derivatives_of_modal_constants_match_differences(plain, altered):
     fit, rig = fitted(plain), replace(NOMINAL, filter_time_constant_s=2e-4, delay_s=1e-3)
     problem = UniformBeamProblem(fit, fit.visible, rig)
-    terms = galerkin_mode_terms(Alteration(**altered), rig.beam, problem.modes)
+    terms = galerkin_mode_terms(BeamDeviations(**altered), rig.beam, problem.modes)
     x, unit, step = problem.starts()[0], np.eye(problem.constant_count), 1e-5
     slopes = problem.residual_and_slopes(x, unit, terms)[1]()
     differences = [

@@ -23,7 +23,7 @@ class Fitted:
     name: str
     bic: float
     deviance: float
-    parameters: int = 8
+    parameter_count: int = 8
     structure: object = field(init=False)
     fit: object = field(default_factory=lambda: SimpleNamespace(parameters={"alpha": 0.9}))
 
@@ -53,6 +53,6 @@ def test_doubtful_order_is_undecided(candidates, doubt, status):
 @pytest.mark.fit
 def test_structures_with_an_excluded_order_are_excluded(candidates):
     """By all that it lacks, type III would still do: two orders at once may cost more than one."""
-    rig = candidates(Fitted("VI", 0.0, -71.0), Fitted("III", -1.0, -58.0, parameters=6))
+    rig = candidates(Fitted("VI", 0.0, -71.0), Fitted("III", -1.0, -58.0, parameter_count=6))
     assert dict(structures(rig, frozenset()))["III"] == "compatible"
     assert dict(structures(rig, frozenset({"alpha"})))["III"] == "excluded"

@@ -127,7 +127,7 @@ def test_the_table_ranks_the_structures(type_iii):
     assert min(row.delta_aic for row in verdict.table) == 0
     at = {row.structure: row for row in verdict.table}
     freed = at["VII"]
-    count = type_iii.candidates[0].values
+    count = type_iii.candidates[0].compared_value_count
     gained = count * np.log(at["III"].cost / freed.cost)
     assert freed.delta_bic == pytest.approx(np.log(count) - gained)
     assert at["II"].delta_bic > 1000
@@ -336,7 +336,7 @@ def test_profile_agrees_with_a_fit_of_fixed_order(type_iii, sessions):
     ]
     analysis = fit_record(sessions("III").measured(noise_nm=NOISE_NM, seed=41), held)
     costs = np.array([each.cost for each in analysis.fits])
-    deviance = type_iii.candidates[0].values * np.log(costs / costs[0])
+    deviance = type_iii.candidates[0].compared_value_count * np.log(costs / costs[0])
     assert deviance[1:] == pytest.approx(CHI_SQUARE_95, rel=0.05)
     assert profile.identifiable
     assert profile.relative_width < 0.02
