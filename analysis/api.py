@@ -183,7 +183,7 @@ def fit(
         return fit_record(
             Measurement.from_record(record),
             [STRUCTURES[type_name] for type_name in types or STRUCTURES],
-            fixed=fixed,
+            fixed_settings=fixed,
             band_hz=record_band_hz(record, band_hz),
         )
     if method == "welch":

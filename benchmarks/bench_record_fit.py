@@ -119,11 +119,11 @@ class Peer:
     def cost(self, x: NDArray[np.float64]) -> float:
         """Return the sum of squares, with the free decay projected out."""
         comparison, plant = self.comparison, self.unknowns.plant(x)
-        torque, _ = comparison.prediction.torque(plant)
-        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
+        torque, _ = comparison.torque_predictor.torque(plant)
+        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained_samples])
         residual *= self.weight
-        poles = plant.mode_poles(comparison.visible_modes, ())
-        columns = comparison.decays.spectra(poles) * self.weight
+        poles = plant.mode_poles(comparison.visible_mode_count, ())
+        columns = comparison.decay_spectra.spectra(poles) * self.weight
         gram = (columns.conj() @ columns.T).real
         projection = (columns.conj() @ residual).real
         scale = np.sqrt(np.diag(gram))

@@ -180,7 +180,7 @@ def fit_record(
         rest_angle_rad=0.0,
     )
     comparison = Comparison.from_measurement(measurement, band_hz)
-    torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
+    torque = comparison.spectrum(comparison.torque_nm[comparison.retained_samples])
     power = np.full(torque.size, np.mean(np.abs(torque) ** 2))
     white = NoiseSpectrum(power, np.ones(torque.size, dtype=bool), ())
     starts = [(number, hz, 0.005) for number, hz in enumerate(starts_hz, start=1)]

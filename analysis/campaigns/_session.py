@@ -281,7 +281,9 @@ def _session_result(
         modal=None
         if modal_estimate is None or not modal_estimate.visible
         else modal_estimate.restrict_to_visible_modes(),
-        nominal=None if whole_fits is None else whole_fits.analysis.comparison.measurement.nominal,
+        nominal=None
+        if whole_fits is None
+        else whole_fits.analysis.comparison.measurement.nominal_plant,
         uniformity=record.uniformity,
     )
 

@@ -150,12 +150,12 @@ def leave_one_out_results(
         return FailedPrediction(path, str(why))
     except MemoryError:
         return FailedPrediction(path, "not enough memory to predict it; use fewer --jobs")
-    measured_torque_nm = comparison.torque_nm[comparison.retained]
+    measured_torque_nm = comparison.torque_nm[comparison.retained_samples]
     torque_norm = np.linalg.norm(comparison.spectrum(measured_torque_nm))
 
     def prediction_error(plant: Plant) -> float:
         """Return the relative error of the torque that a plant predicts."""
-        predicted_torque_nm, _ = comparison.prediction.torque(plant)
+        predicted_torque_nm, _ = comparison.torque_predictor.torque(plant)
         return float(
             np.linalg.norm(comparison.spectrum(predicted_torque_nm - measured_torque_nm))
             / torque_norm

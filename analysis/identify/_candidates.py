@@ -131,7 +131,7 @@ class CandidateSet:
                 misread_findings=misread_findings,
             )
         candidate_set = cls._from_uniform_beam(
-            fit_record(measurement, fixed=fixed_settings, band_hz=band_hz), fixed_settings
+            fit_record(measurement, fixed_settings=fixed_settings, band_hz=band_hz), fixed_settings
         )
         return candidate_set._exclude_leakage()
 
@@ -152,7 +152,7 @@ class CandidateSet:
         """
         first_candidate, *other_candidates = earlier_candidates
         unknowns = Unknowns.for_structure(
-            first_candidate.structure, measurement.nominal, free_settings(fixed_settings)
+            first_candidate.structure, measurement.nominal_plant, free_settings(fixed_settings)
         )
         analysis = refit_record(measurement, unknowns, first_candidate.fit.plant, band_hz=band_hz)
         if analysis is None:
@@ -186,7 +186,7 @@ class CandidateSet:
         """
         structures = (_FREEST_STRUCTURE, *additional_structures)
         return cls._from_uniform_beam(
-            fit_record(measurement, structures, fixed=fixed_settings, band_hz=band_hz),
+            fit_record(measurement, structures, fixed_settings=fixed_settings, band_hz=band_hz),
             fixed_settings,
         )
 
@@ -277,7 +277,7 @@ class CandidateSet:
     def unknowns(self, structure: Structure) -> Unknowns:
         """Return the unknown parameters that a fit of a damping structure to this record varies."""
         return Unknowns.for_structure(
-            structure, self.comparison.measurement.nominal, self.free_settings
+            structure, self.comparison.measurement.nominal_plant, self.free_settings
         )
 
     def refit(self, candidate: Candidate, max_evaluations: int = DESCENT_EVALUATIONS) -> Refit:

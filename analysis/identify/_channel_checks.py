@@ -36,29 +36,28 @@ reported as clipping. Noise does not repeat its largest value."""
 _STANDSTILL_BLOCK_S: Final = 0.5
 """Duration in seconds of the blocks in which a standstill of the motor is searched for."""
 
-_MAX_STANDSTILL_MOTION: Final = 0.02
+_MAX_STANDSTILL_MOTION_RATIO: Final = 0.02
 """Largest motion of a motor at standstill within a block, relative to its reference."""
 
 
 def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
     """Yield a finding if the torque is clipped: several values lie exactly at its extremes."""
-    known_nm = np.where(measurement.torque_known, measurement.torque_nm, np.nan)
-    clipped = [
+    known_torque_nm = np.where(measurement.torque_known, measurement.torque_nm, np.nan)
+    clipped_extremes = [
         extreme
-        for extreme in measurement.torque_extremes or torque_extremes(known_nm)
+        for extreme in measurement.torque_extremes or torque_extremes(known_torque_nm)
         if extreme.limit_nm != 0 and extreme.repeated_count >= _MIN_CLIPPED_VALUES
     ]
-    if not clipped:
+    if not clipped_extremes:
         return
-    limits_text = " and ".join(f"{extreme.limit_nm:+.3g} N·m" for extreme in clipped)
-    clipped_tick_count = sum(extreme.sample_count for extreme in clipped)
+    limits_text = " and ".join(f"{extreme.limit_nm:+.3g} N·m" for extreme in clipped_extremes)
+    clipped_tick_count = sum(extreme.sample_count for extreme in clipped_extremes)
     yield Finding(
         kind="clipping",
         sentence=(
-            f"The torque is clipped at {limits_text}: {clipped_tick_count} values lie exactly "
-            "there and none beyond, and no flag says so."
+            f"The torque is clipped at {limits_text}: {clipped_tick_count} values lie exactly there and none beyond, and no flag says so."
         ),
-        value=max(abs(extreme.limit_nm) for extreme in clipped),
+        value=max(abs(extreme.limit_nm) for extreme in clipped_extremes),
         unit="N·m",
         remedy="Use a larger range of the sensor, or a smaller amplitude; flag clipped values.",
     )
@@ -80,18 +79,16 @@ def standstill_findings(measurement: Measurement) -> Iterator[Finding]:
         )
         for angle_values_rad in (measurement.angle_rad, reference_rad)
     )
-    is_still = (reference_motion_rad > np.median(reference_motion_rad)) & (
-        motion_rad < _MAX_STANDSTILL_MOTION * reference_motion_rad
+    is_standstill_block = (reference_motion_rad > np.median(reference_motion_rad)) & (
+        motion_rad < _MAX_STANDSTILL_MOTION_RATIO * reference_motion_rad
     )
-    if not is_still.any():
+    if not is_standstill_block.any():
         return
-    longest_still_blocks, first_still_block = longest_run(is_still)
+    longest_still_blocks, first_still_block = longest_run(is_standstill_block)
     yield Finding(
         kind="stop",
         sentence=(
-            f"The motor does not move from {first_still_block * _STANDSTILL_BLOCK_S:.1f} to "
-            f"{(first_still_block + longest_still_blocks) * _STANDSTILL_BLOCK_S:.1f} s of the "
-            "record, although its reference does."
+            f"The motor does not move from {first_still_block * _STANDSTILL_BLOCK_S:.1f} to {(first_still_block + longest_still_blocks) * _STANDSTILL_BLOCK_S:.1f} s of the record, although its reference does."
         ),
         value=longest_still_blocks * _STANDSTILL_BLOCK_S,
         unit="s",
@@ -104,7 +101,7 @@ def standstill_findings(measurement: Measurement) -> Iterator[Finding]:
 _ASSUMED_INTERNAL_DAMPING_S: Final = 1e-4
 """Assumed coefficient of internal damping of order 1, in seconds: a loss of a few per cent."""
 
-_MIN_DRIVEN_POWER: Final = 1e-3
+_MIN_DRIVEN_POWER_FRACTION: Final = 1e-3
 """Minimum power of the angle at a frequency that is used, relative to the largest power."""
 
 _AVERAGED_FREQUENCIES: Final = 16
@@ -125,36 +122,36 @@ _UNIT_FACTORS: Final = (
 )
 """Factors by which a wrong unit changes the ratio of torque to angle, with their descriptions."""
 
-_LOG_FACTOR_TOLERANCE: Final = math.log(1.1)
+_LOG_UNIT_FACTOR_TOLERANCE: Final = math.log(1.1)
 """Largest difference between the logarithms of a measured factor and of a known unit factor that
 are considered equal."""
 
-_MIN_LOG_FACTOR: Final = math.log(2.0)
+_MIN_LOG_UNIT_FACTOR: Final = math.log(2.0)
 """Logarithm of the smallest factor that is attributed to a wrong unit. A smaller one is attributed
 to wrong data of the beam."""
 
-_CERTAIN_LOG_FACTOR: Final = math.log(5.0)
+_CERTAIN_LOG_UNIT_FACTOR: Final = math.log(5.0)
 """Logarithm of the factor above which an unknown factor is attributed to a wrong unit, too: no fit
 searches for a stiffness so far from that of the file."""
 
 
 def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     """Yield a finding if the ratio of torque to motor angle has a wrong sign or a wrong unit."""
-    angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained])
-    torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained])
+    angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained_samples])
+    torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained_samples])
     angle_power = np.abs(angle_spectrum) ** 2
-    is_driven = angle_power > _MIN_DRIVEN_POWER * angle_power.max()
-    beam = comparison.measurement.nominal.beam
+    is_driven_bin = angle_power > _MIN_DRIVEN_POWER_FRACTION * angle_power.max()
+    beam = comparison.measurement.nominal_plant.beam
     expected_response = transfer(
-        2j * np.pi * comparison.frequency_hz[is_driven],
+        2j * np.pi * comparison.frequency_hz[is_driven_bin],
         beam,
         Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S),
     )
-    expected_torque = angle_spectrum[is_driven] * expected_response
+    expected_torque = angle_spectrum[is_driven_bin] * expected_response
     first_frequencies = np.arange(0, expected_torque.size, _AVERAGED_FREQUENCIES)
     expected_power = np.add.reduceat(np.abs(expected_torque) ** 2, first_frequencies)
     torque_ratio = (
-        np.add.reduceat(torque_spectrum[is_driven] * expected_torque.conj(), first_frequencies)
+        np.add.reduceat(torque_spectrum[is_driven_bin] * expected_torque.conj(), first_frequencies)
         / expected_power
     )
     ratio_magnitude = np.abs(torque_ratio)
@@ -167,16 +164,14 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
         yield Finding(
             kind="sign",
             sentence=(
-                "Torque or angle has the wrong sign: the torque is opposite to that of the beam at "
-                "nearly all frequencies. No number here is valid for the antenna."
+                "Torque or angle has the wrong sign: the torque is opposite to that of the beam at nearly all frequencies. No number here is valid for the antenna."
             ),
             remedy=(
-                "Reverse the sign of one channel: the torque is positive where the motor pushes "
-                "the beam towards positive angles."
+                "Reverse the sign of one channel: the torque is positive where the motor pushes the beam towards positive angles."
             ),
         )
     median_magnitude = _weighted_median(ratio_magnitude, np.sqrt(expected_power))
-    if not median_magnitude > 0 or abs(math.log(median_magnitude)) < _MIN_LOG_FACTOR:
+    if not median_magnitude > 0 or abs(math.log(median_magnitude)) < _MIN_LOG_UNIT_FACTOR:
         return
     log_differences = {
         unit_description: abs(abs(math.log(median_magnitude)) - abs(math.log(unit_factor)))
@@ -185,9 +180,9 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     matching_units = [
         unit_description
         for unit_description in sorted(log_differences, key=log_differences.__getitem__)
-        if log_differences[unit_description] < _LOG_FACTOR_TOLERANCE
+        if log_differences[unit_description] < _LOG_UNIT_FACTOR_TOLERANCE
     ]
-    if not matching_units and abs(math.log(median_magnitude)) < _CERTAIN_LOG_FACTOR:
+    if not matching_units and abs(math.log(median_magnitude)) < _CERTAIN_LOG_UNIT_FACTOR:
         return
     explanation = (
         f"which is the factor of {' or of '.join(matching_units)}: a wrong unit"
@@ -197,9 +192,7 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     yield Finding(
         kind="unit",
         sentence=(
-            f"Torque over angle is {median_magnitude:.3g} times what the beam in the file gives, "
-            f"{explanation}. "
-            "No number here is valid for the antenna."
+            f"Torque over angle is {median_magnitude:.3g} times what the beam in the file gives, {explanation}. No number here is valid for the antenna."
         ),
         value=median_magnitude,
         remedy="Check the units of angle and torque, and import the record again.",

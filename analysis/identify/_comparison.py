@@ -33,18 +33,18 @@ if TYPE_CHECKING:
     from analysis.identify.noise import Hum, NoiseSpectrum
     from rigd.beam import Plant, Pole
 
-_MIN_BINS: Final = 50
+_MIN_FREQUENCY_BINS: Final = 50
 """Minimum number of frequency bins in the compared band."""
 
 _MAX_REMOVED_TORQUE_CHANGE: Final = 0.1
 """Change of the torque caused by the part of the angle that is incoherent with the reference, as a
 sum of whitened squares, up to which this torque is not recomputed."""
 
-_FEEDBACK_ITERATIONS: Final = 3
+_ANGLE_FEEDBACK_ITERATIONS: Final = 3
 """Number of iterations between the torque of the ringing beam and the part of the angle that
 follows the reference."""
 
-_MAX_INCOHERENT_FRACTION: Final = 0.3
+_MAX_INCOHERENT_SPEED_FRACTION: Final = 0.3
 """Largest fraction of the power of the motor's speed that may be incoherent with the reference. If
 it is larger, the motor followed another reference, and the whole angle is used."""
 
@@ -65,39 +65,39 @@ class Comparison:
         Both channels in the band at the decimated rate; unknown torque is filled by the prediction.
     decimation : Decimation
         Low-pass filter and downsampling from the full rate.
-    retained : slice
+    retained_samples : slice
         Samples that are compared.
-    prediction : TorquePredictor
+    torque_predictor : TorquePredictor
         Prediction of the torque from `angle_rad`.
-    bins : slice
+    band_bins : slice
         Bins of the residual's transform that lie in the band.
     frequency_hz : ndarray, shape (K,)
         Frequencies of these bins.
-    visible_modes : int
+    visible_mode_count : int
         Number of modes of the nominal beam in the band; their free decay is projected out.
-    decays : DecaySpectra
+    decay_spectra : DecaySpectra
         Spectra of the free decay at the beginning.
-    later_decays : tuple of LaterDecaySpectra
+    later_decay_spectra : tuple of LaterDecaySpectra
         Spectra of the free decay after each gap of the angle that is too long to interpolate.
-    removed_nm : ndarray, shape (samples,)
+    removed_torque_nm : ndarray, shape (samples,)
         Torque by impacts, drag, hum and the incoherent angle that was removed, at the retained
         samples.
-    removed_in_gaps_nm : ndarray, shape (u,)
+    removed_torque_in_gaps_nm : ndarray, shape (u,)
         The same torque at the ticks with unknown torque.
     hum : tuple of Hum
         Hum that was removed, as estimated; its remainder is projected out.
-    incoherent_rad : ndarray, shape (m,), or float
+    incoherent_angle_rad : ndarray, shape (m,), or float
         Part of the angle that is incoherent with the reference; 0 if the whole angle is used.
-    incoherent_nm, incoherent_in_gaps_nm : ndarray or float
-        Torque caused by `incoherent_rad`, which was removed: at the retained samples, and at the
-        ticks with unknown torque.
+    incoherent_torque_nm, incoherent_torque_in_gaps_nm : ndarray or float
+        Torque caused by `incoherent_angle_rad`, which was removed: at the retained samples, and at
+        the ticks with unknown torque.
     drag : DragExpansion, optional
         Removed torque by drag, and its derivatives with respect to the beam.
     impact_spectra : ndarray of complex, shape (k, K), or None
         Spectra of the torque by impacts with unknown amplitudes, in addition to the removed torque.
     last_poles_rad_s : list of complex
         Poles of the last plant, from which the search for the poles of the next plant starts.
-    shared_values : RecentValues
+    shared_result_cache : RecentValues
         Cache of one result, common to all objectives of a long record: one result for each
         objective would take too much memory.
     """
@@ -106,23 +106,23 @@ class Comparison:
     angle_rad: NDArray[np.float64]
     torque_nm: NDArray[np.float64]
     decimation: Decimation
-    retained: slice
-    prediction: TorquePredictor
-    bins: slice
+    retained_samples: slice
+    torque_predictor: TorquePredictor
+    band_bins: slice
     frequency_hz: NDArray[np.float64]
-    visible_modes: int
-    decays: DecaySpectra
-    later_decays: tuple[LaterDecaySpectra, ...] = ()
-    removed_nm: NDArray[np.float64] | float = 0.0
-    removed_in_gaps_nm: NDArray[np.float64] | float = 0.0
+    visible_mode_count: int
+    decay_spectra: DecaySpectra
+    later_decay_spectra: tuple[LaterDecaySpectra, ...] = ()
+    removed_torque_nm: NDArray[np.float64] | float = 0.0
+    removed_torque_in_gaps_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
-    incoherent_rad: NDArray[np.float64] | float = 0.0
-    incoherent_nm: NDArray[np.float64] | float = 0.0
-    incoherent_in_gaps_nm: NDArray[np.float64] | float = 0.0
+    incoherent_angle_rad: NDArray[np.float64] | float = 0.0
+    incoherent_torque_nm: NDArray[np.float64] | float = 0.0
+    incoherent_torque_in_gaps_nm: NDArray[np.float64] | float = 0.0
     drag: DragExpansion | None = None
     impact_spectra: NDArray[np.complex128] | None = None
     last_poles_rad_s: list[complex] = field(default_factory=list)
-    shared_values: RecentValues[Any] = field(default_factory=lambda: RecentValues(1))
+    shared_result_cache: RecentValues[Any] = field(default_factory=lambda: RecentValues(1))
 
     @classmethod
     def from_measurement(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
@@ -144,40 +144,44 @@ class Comparison:
             The record cannot be used, or is too short for the band.
         """
         lowest_hz, highest_hz = band_hz
-        limit_hz = MAX_FREQUENCY_TO_RATE_RATIO * measurement.rate_hz
-        if not 0 <= lowest_hz < highest_hz <= limit_hz:
+        band_limit_hz = MAX_FREQUENCY_TO_RATE_RATIO * measurement.rate_hz
+        if not 0 <= lowest_hz < highest_hz <= band_limit_hz:
             raise MeasurementError(
                 f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
-                f"or beyond {MAX_FREQUENCY_TO_RATE_RATIO:g} of the sampling rate ({limit_hz:g} "
-                "Hz); "
-                "choose another --band."
+                f"or beyond {MAX_FREQUENCY_TO_RATE_RATIO:g} of the sampling rate "
+                f"({band_limit_hz:g} "
+                "Hz); choose another --band."
             )
-        measurement.check(highest_hz)
+        measurement.check_channels(highest_hz)
         decimation = Decimation.to_band(measurement.rate_hz, highest_hz)
-        angle_rad = decimation.apply(measurement.angle_from_rest(highest_hz))
+        angle_rad = decimation.apply(measurement.angle_from_rest_rad(highest_hz))
         usable_samples = decimation.samples_inside_record(measurement.angle_rad.size)
-        samples = usable_samples.stop - usable_samples.start
-        if samples > 0:
-            samples = fast_fft_length_below(samples)
-        all_hz = np.arange(samples // 2 + 1) * (decimation.rate_hz / max(samples, 1))
-        first_bin = max(int(np.searchsorted(all_hz, lowest_hz)), 1)
-        bins = slice(first_bin, int(np.searchsorted(all_hz, highest_hz, side="right")))
-        if bins.stop - bins.start < _MIN_BINS:
+        sample_count = usable_samples.stop - usable_samples.start
+        if sample_count > 0:
+            sample_count = fast_fft_length_below(sample_count)
+        all_frequencies_hz = np.arange(sample_count // 2 + 1) * (
+            decimation.rate_hz / max(sample_count, 1)
+        )
+        first_bin = max(int(np.searchsorted(all_frequencies_hz, lowest_hz)), 1)
+        band_bins = slice(
+            first_bin, int(np.searchsorted(all_frequencies_hz, highest_hz, side="right"))
+        )
+        if band_bins.stop - band_bins.start < _MIN_FREQUENCY_BINS:
             raise MeasurementError(
                 f"{measurement.name}: {measurement.angle_rad.size / measurement.rate_hz:.3g} s of "
                 f"record are too short for the band {lowest_hz:g}-{highest_hz:g} Hz: "
-                f"{max(bins.stop - bins.start, 0)} frequencies, at least {_MIN_BINS} are "
-                "needed; record longer or widen the band."
+                f"{max(band_bins.stop - band_bins.start, 0)} frequencies, at least "
+                f"{_MIN_FREQUENCY_BINS} are needed; record longer or widen the band."
             )
-        retained = slice(usable_samples.start, usable_samples.start + samples)
-        frequency_hz = all_hz[bins]
+        retained_samples = slice(usable_samples.start, usable_samples.start + sample_count)
+        frequency_hz = all_frequencies_hz[band_bins]
         nominal_beam = measurement.beam
         angle_gaps = measurement.long_gaps(highest_hz)
         if angle_gaps:
             measurement = measurement.without_torque_in(angle_gaps)
         torque_is_known, torque_nm = measurement.torque_known, measurement.torque_nm
         ticks = np.arange(torque_nm.size)
-        interpolated_nm = (
+        interpolated_torque_nm = (
             torque_nm
             if torque_is_known.all()
             else np.interp(ticks, ticks[torque_is_known], torque_nm[torque_is_known])
@@ -186,28 +190,32 @@ class Comparison:
         comparison = cls(
             measurement=measurement,
             angle_rad=angle_rad,
-            torque_nm=decimation.apply(interpolated_nm),
+            torque_nm=decimation.apply(interpolated_torque_nm),
             decimation=decimation,
-            retained=retained,
-            prediction=TorquePredictor(angle_rad, decimation.rate_hz, retained),
-            bins=bins,
+            retained_samples=retained_samples,
+            torque_predictor=TorquePredictor(angle_rad, decimation.rate_hz, retained_samples),
+            band_bins=band_bins,
             frequency_hz=frequency_hz,
-            visible_modes=int(
+            visible_mode_count=int(
                 np.sum(undamped_frequencies_rad_s(nominal_beam, 50) < 2 * np.pi * highest_hz)
             ),
-            decays=DecaySpectra(samples, decimation.rate_hz, omega_rad_s),
+            decay_spectra=DecaySpectra(sample_count, decimation.rate_hz, omega_rad_s),
         )
-        gap_end_s = [
+        gap_ends_s = [
             gap_end / measurement.rate_hz - comparison.first_sample_s for _, gap_end in angle_gaps
         ]
-        later_decays = tuple(
+        later_decay_spectra = tuple(
             LaterDecaySpectra(
-                samples, decimation.rate_hz, omega_rad_s, decay_start_s, 1 / measurement.rate_hz
+                sample_count,
+                decimation.rate_hz,
+                omega_rad_s,
+                decay_start_s,
+                1 / measurement.rate_hz,
             )
-            for decay_start_s in gap_end_s
-            if 0 < decay_start_s < (samples - 1) / decimation.rate_hz
+            for decay_start_s in gap_ends_s
+            if 0 < decay_start_s < (sample_count - 1) / decimation.rate_hz
         )
-        comparison = replace(comparison, later_decays=later_decays)
+        comparison = replace(comparison, later_decay_spectra=later_decay_spectra)
         return comparison._remove_impacts() if measurement.impacts else comparison
 
     def _remove_impacts(self) -> Comparison:
@@ -217,46 +225,46 @@ class Comparison:
         """
         rate_hz, impacts = self.decimation.rate_hz, self.measurement.impacts
         sample_times_s = self.times_s()
-        unknown_indices = self._decimated_indices(~self.measurement.torque_known)
-        reach_s = self.decimation.half_length_samples / rate_hz
-        unknown_times_s = unknown_indices / self.measurement.rate_hz - reach_s
-        impact_nm, impact_at_unknown_nm = (
+        unknown_torque_indices = self._decimated_indices(~self.measurement.torque_known)
+        filter_reach_s = self.decimation.half_length_samples / rate_hz
+        unknown_torque_times_s = unknown_torque_indices / self.measurement.rate_hz - filter_reach_s
+        impact_torque_nm, impact_torque_in_gaps_nm = (
             np.sum([impact.torque(time_s, sample_times_s, rate_hz) for impact in impacts], axis=0)
-            for time_s in (sample_times_s, unknown_times_s)
+            for time_s in (sample_times_s, unknown_torque_times_s)
         )
         impact_torques = np.concatenate(
             [impact.unit_torques(sample_times_s, rate_hz) for impact in impacts]
         )
         return replace(self, impact_spectra=self.spectrum(impact_torques))._remove_torque(
-            impact_nm, impact_at_unknown_nm
+            impact_torque_nm, impact_torque_in_gaps_nm
         )
 
     def _remove_torque(
-        self, torque_nm: NDArray[np.float64] | float, unknown_tick_nm: NDArray[np.float64] | float
+        self, torque_nm: NDArray[np.float64] | float, torque_in_gaps_nm: NDArray[np.float64] | float
     ) -> Comparison:
         """Return the comparison with a torque in N·m subtracted from the measured torque.
 
-        `torque_nm` is that at the retained samples, and `unknown_tick_nm` that at the ticks at
+        `torque_nm` is that at the retained samples, and `torque_in_gaps_nm` that at the ticks at
         which the torque was not measured.
         """
-        remaining_nm = self.torque_nm.copy()
-        remaining_nm[self.retained] -= torque_nm
+        remaining_torque_nm = self.torque_nm.copy()
+        remaining_torque_nm[self.retained_samples] -= torque_nm
         return replace(
             self,
-            torque_nm=remaining_nm,
-            removed_nm=self.removed_nm + torque_nm,
-            removed_in_gaps_nm=self.removed_in_gaps_nm + unknown_tick_nm,
+            torque_nm=remaining_torque_nm,
+            removed_torque_nm=self.removed_torque_nm + torque_nm,
+            removed_torque_in_gaps_nm=self.removed_torque_in_gaps_nm + torque_in_gaps_nm,
         )
 
     def times_s(self) -> NDArray[np.float64]:
         """Return the times of the compared samples since the record's first tick, (samples,)."""
-        return self.first_sample_s + np.arange(self.samples) / self.decimation.rate_hz
+        return self.first_sample_s + np.arange(self.sample_count) / self.decimation.rate_hz
 
     @property
     def first_sample_s(self) -> float:
         """Return the time in seconds from the record's first tick to the first compared sample."""
         return (
-            float(self.retained.start - self.decimation.half_length_samples)
+            float(self.retained_samples.start - self.decimation.half_length_samples)
             / self.decimation.rate_hz
         )
 
@@ -266,21 +274,23 @@ class Comparison:
         return self.frequency_hz.size > MAX_BINS_OF_STORED_RESULTS
 
     @property
-    def samples(self) -> int:
+    def sample_count(self) -> int:
         """Return the number of compared time samples, at the decimated rate."""
-        return int(self.retained.stop - self.retained.start)
+        return int(self.retained_samples.stop - self.retained_samples.start)
 
-    def poles(self, plant: Plant, wrt: Sequence[str] = ()) -> tuple[Pole, ...]:
+    def poles(self, plant: Plant, gradient_parameters: Sequence[str] = ()) -> tuple[Pole, ...]:
         """Return the poles of a plant's visible modes, whose free decay is projected out.
 
         Parameters
         ----------
         plant : Plant
             Plant with the poles.
-        wrt : sequence of str
+        gradient_parameters : sequence of str
             Parameters with respect to which the poles are differentiated, as for `mode_poles`.
         """
-        poles = plant.mode_poles(self.visible_modes, wrt, self.last_poles_rad_s)
+        poles = plant.mode_poles(
+            self.visible_mode_count, gradient_parameters, self.last_poles_rad_s
+        )
         self.last_poles_rad_s[:] = [pole.at_rad_s for pole in poles]
         return poles
 
@@ -289,18 +299,18 @@ class Comparison:
 
         The shape changes from (..., samples) to (..., K).
         """
-        return np.fft.rfft(time_series)[..., self.bins]
+        return np.fft.rfft(time_series)[..., self.band_bins]
 
-    def in_time(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def to_time_series(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Transform a spectrum in the band, shape (K,), to the time series of retained samples.
 
         The result has the shape (samples,).
         """
-        full_spectrum = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
-        full_spectrum[self.bins] = spectrum
-        return np.fft.irfft(full_spectrum, self.samples)
+        full_spectrum = np.zeros(self.sample_count // 2 + 1, dtype=np.complex128)
+        full_spectrum[self.band_bins] = spectrum
+        return np.fft.irfft(full_spectrum, self.sample_count)
 
-    def coherent_rad(self) -> NDArray[np.float64]:
+    def reference_coherent_angle_rad(self) -> NDArray[np.float64]:
         """Return the part of the motor angle in rad that is coherent with the reference, (m,).
 
         The reference is the angle that the motor's controller was to follow. The whole angle is
@@ -311,12 +321,12 @@ class Comparison:
         coherent_angle_rad = self._coherent_angle_rad(self.angle_rad)
         # The speeds are compared, since a slow drift of the angle does not disturb the estimate.
         angle_power, incoherent_power = (
-            np.sum(np.diff(angle_rad[self.retained]) ** 2)
+            np.sum(np.diff(angle_rad[self.retained_samples]) ** 2)
             for angle_rad in (self.angle_rad, self.angle_rad - coherent_angle_rad)
         )
         return (
             coherent_angle_rad
-            if incoherent_power < _MAX_INCOHERENT_FRACTION * angle_power
+            if incoherent_power < _MAX_INCOHERENT_SPEED_FRACTION * angle_power
             else self.angle_rad
         )
 
@@ -332,11 +342,11 @@ class Comparison:
         # The samples after the record are the filter's response to its end; none is compared.
         recorded_samples = self._recorded_samples
         reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:recorded_samples]
-        coherent_rad = angle_rad.copy()
-        coherent_rad[:recorded_samples] = reference_coherent_part(
+        coherent_angle_rad = angle_rad.copy()
+        coherent_angle_rad[:recorded_samples] = reference_coherent_part(
             angle_rad[:recorded_samples], reference_rad, self.decimation.rate_hz, torque_nm
         )
-        return coherent_rad
+        return coherent_angle_rad
 
     @property
     def _recorded_samples(self) -> int:
@@ -357,34 +367,34 @@ class Comparison:
         Returns
         -------
         Comparison
-            `self` if the whole angle is coherent: see `coherent_rad`.
+            `self` if the whole angle is coherent: see `reference_coherent_angle_rad`.
         """
-        coherent_rad = self.coherent_rad()
-        if coherent_rad is self.angle_rad:
+        coherent_angle_rad = self.reference_coherent_angle_rad()
+        if coherent_angle_rad is self.angle_rad:
             return self
-        return self._use_coherent_angle(self.angle_rad, coherent_rad, plant)
+        return self._use_coherent_angle(self.angle_rad, coherent_angle_rad, plant)
 
     def use_whole_angle(self) -> Comparison:
         """Return a comparison whose input is the whole angle.
 
         The torque of the part that is incoherent with the reference is added again.
         """
-        if not isinstance(self.incoherent_rad, np.ndarray):
+        if not isinstance(self.incoherent_angle_rad, np.ndarray):
             return self
-        angle_rad = self.angle_rad + self.incoherent_rad
+        angle_rad = self.angle_rad + self.incoherent_angle_rad
         return replace(
             self,
             angle_rad=angle_rad,
-            prediction=self.prediction.with_angle(angle_rad),
-            incoherent_rad=0.0,
-            incoherent_nm=0.0,
-            incoherent_in_gaps_nm=0.0,
-        )._remove_torque(-self.incoherent_nm, -self.incoherent_in_gaps_nm)
+            torque_predictor=self.torque_predictor.with_angle(angle_rad),
+            incoherent_angle_rad=0.0,
+            incoherent_torque_nm=0.0,
+            incoherent_torque_in_gaps_nm=0.0,
+        )._remove_torque(-self.incoherent_torque_nm, -self.incoherent_torque_in_gaps_nm)
 
     def _use_coherent_angle(
         self,
         angle_rad: NDArray[np.float64],
-        coherent_rad: NDArray[np.float64],
+        coherent_angle_rad: NDArray[np.float64],
         plant: Plant | ModalModel,
     ) -> Comparison:
         """Return a comparison whose input is the reference-coherent part of the angle.
@@ -393,9 +403,9 @@ class Comparison:
         """
         return replace(
             self,
-            angle_rad=coherent_rad,
-            prediction=self.prediction.with_angle(coherent_rad),
-            incoherent_rad=angle_rad - coherent_rad,
+            angle_rad=coherent_angle_rad,
+            torque_predictor=self.torque_predictor.with_angle(coherent_angle_rad),
+            incoherent_angle_rad=angle_rad - coherent_angle_rad,
         ).recompute_incoherent_torque(plant)
 
     def recompute_incoherent_torque(self, plant: Plant | ModalModel) -> Comparison:
@@ -405,20 +415,23 @@ class Comparison:
         incoherent angle is the part that does not follow the reference of the motor's controller.
         Return `self` if the whole angle is coherent with the reference.
         """
-        if not isinstance(self.incoherent_rad, np.ndarray):
+        if not isinstance(self.incoherent_angle_rad, np.ndarray):
             return self
-        incoherent_prediction = self.prediction.with_angle(self.incoherent_rad)
-        incoherent_nm = incoherent_prediction.torque(plant)[0]
-        unknown_tick_nm = incoherent_prediction.torque_at_fine_samples(
+        incoherent_torque_predictor = self.torque_predictor.with_angle(self.incoherent_angle_rad)
+        incoherent_torque_nm = incoherent_torque_predictor.torque(plant)[0]
+        incoherent_torque_in_gaps_nm = incoherent_torque_predictor.torque_at_fine_samples(
             plant,
             self.decimation.downsampling_factor,
             self._decimated_indices(~self.measurement.torque_known),
         )[0]
         updated_comparison = replace(
-            self, incoherent_nm=incoherent_nm, incoherent_in_gaps_nm=unknown_tick_nm
+            self,
+            incoherent_torque_nm=incoherent_torque_nm,
+            incoherent_torque_in_gaps_nm=incoherent_torque_in_gaps_nm,
         )
         return updated_comparison._remove_torque(
-            incoherent_nm - self.incoherent_nm, unknown_tick_nm - self.incoherent_in_gaps_nm
+            incoherent_torque_nm - self.incoherent_torque_nm,
+            incoherent_torque_in_gaps_nm - self.incoherent_torque_in_gaps_nm,
         )
 
     def with_reestimated_angle(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
@@ -440,39 +453,48 @@ class Comparison:
         updated_comparison = self.recompute_incoherent_torque(plant)
         if updated_comparison is self:
             return self
-        whitened_change = (
-            self.spectrum(updated_comparison.incoherent_nm - np.asarray(self.incoherent_nm))
+        whitened_torque_change = (
+            self.spectrum(
+                updated_comparison.incoherent_torque_nm - np.asarray(self.incoherent_torque_nm)
+            )
             * noise.weight
         )
-        if np.vdot(whitened_change, whitened_change).real <= _MAX_REMOVED_TORQUE_CHANGE:
+        if (
+            np.vdot(whitened_torque_change, whitened_torque_change).real
+            <= _MAX_REMOVED_TORQUE_CHANGE
+        ):
             return self
-        whole_angle_rad, coherent_rad = self.angle_rad + self.incoherent_rad, self.angle_rad
-        coherent_prediction = TorquePredictor(
-            coherent_rad, self.decimation.rate_hz, slice(0, self._recorded_samples)
+        whole_angle_rad, coherent_angle_rad = (
+            self.angle_rad + self.incoherent_angle_rad,
+            self.angle_rad,
+        )
+        coherent_torque_predictor = TorquePredictor(
+            coherent_angle_rad, self.decimation.rate_hz, slice(0, self._recorded_samples)
         )
         # The torque of a ringing beam moves the motor, and that motion changes the ringing.
-        for _ in range(_FEEDBACK_ITERATIONS):
-            torque_nm = coherent_prediction.with_angle(coherent_rad).torque(plant)[0]
-            coherent_rad = self._coherent_angle_rad(whole_angle_rad, torque_nm)
-        return self._use_coherent_angle(whole_angle_rad, coherent_rad, plant)
+        for _ in range(_ANGLE_FEEDBACK_ITERATIONS):
+            torque_nm = coherent_torque_predictor.with_angle(coherent_angle_rad).torque(plant)[0]
+            coherent_angle_rad = self._coherent_angle_rad(whole_angle_rad, torque_nm)
+        return self._use_coherent_angle(whole_angle_rad, coherent_angle_rad, plant)
 
     @property
     def hum_nm(self) -> NDArray[np.float64] | float:
         """Return the removed hum torque in N·m at the retained samples; 0 if there is no hum."""
-        return self._hum_torque_at(np.arange(self.samples) / self.decimation.rate_hz)
+        return self._hum_torque_at(np.arange(self.sample_count) / self.decimation.rate_hz)
 
     def remove_hum(self, hum: tuple[Hum, ...]) -> Comparison:
         """Return the comparison with only the given hum subtracted from the torque.
 
         Hum that was subtracted before is added again.
         """
-        with_new_hum = replace(self, hum=hum)
-        unknown_indices = self._decimated_indices(~self.measurement.torque_known)
-        first_sample_s = self.retained.start / self.decimation.rate_hz
-        unknown_times_s = unknown_indices / self.measurement.rate_hz - first_sample_s
-        return with_new_hum._remove_torque(
-            with_new_hum.hum_nm - self.hum_nm,
-            with_new_hum._hum_torque_at(unknown_times_s) - self._hum_torque_at(unknown_times_s),
+        comparison_with_new_hum = replace(self, hum=hum)
+        unknown_torque_indices = self._decimated_indices(~self.measurement.torque_known)
+        first_sample_s = self.retained_samples.start / self.decimation.rate_hz
+        unknown_torque_times_s = unknown_torque_indices / self.measurement.rate_hz - first_sample_s
+        return comparison_with_new_hum._remove_torque(
+            comparison_with_new_hum.hum_nm - self.hum_nm,
+            comparison_with_new_hum._hum_torque_at(unknown_torque_times_s)
+            - self._hum_torque_at(unknown_torque_times_s),
         )
 
     def drag_response(
@@ -488,7 +510,7 @@ class Comparison:
             Modes whose poles and phases replace those of the plant, as for `DragResponse`.
         """
         # Drag acts on the whole motion, whether or not it follows the reference.
-        angle_rad = self.angle_rad + self.incoherent_rad
+        angle_rad = self.angle_rad + self.incoherent_angle_rad
         return DragResponse(angle_rad, self.decimation.rate_hz, plant, measured_modes)
 
     def remove_drag_torque(
@@ -511,34 +533,37 @@ class Comparison:
             The drag is too large for the time steps.
         """
         drag_response = self.drag_response(plant, measured_modes)
-        drag_torque = drag_response.torque(law, range(1, self.visible_modes + 1))
+        drag_torque = drag_response.torque(law, range(1, self.visible_mode_count + 1))
 
-        def band(time_series: NDArray[np.float64]) -> NDArray[np.complex128]:
-            return self.spectrum(time_series[..., self.retained])
+        def band_spectrum(time_series: NDArray[np.float64]) -> NDArray[np.complex128]:
+            return self.spectrum(time_series[..., self.retained_samples])
 
-        unknown_indices = self._decimated_indices(~self.measurement.torque_known)
-        full_rate_nm = np.fft.irfft(
+        unknown_torque_indices = self._decimated_indices(~self.measurement.torque_known)
+        full_rate_drag_torque_nm = np.fft.irfft(
             self.decimation.downsampling_factor * np.fft.rfft(drag_torque.torque_nm),
             self.decimation.downsampling_factor * drag_torque.torque_nm.size,
         )
         return replace(
             self,
             torque_nm=self.torque_nm - drag_torque.torque_nm,
-            removed_nm=self.removed_nm + drag_torque.torque_nm[self.retained],
-            removed_in_gaps_nm=self.removed_in_gaps_nm + full_rate_nm[unknown_indices],
+            removed_torque_nm=self.removed_torque_nm + drag_torque.torque_nm[self.retained_samples],
+            removed_torque_in_gaps_nm=self.removed_torque_in_gaps_nm
+            + full_rate_drag_torque_nm[unknown_torque_indices],
             drag=DragExpansion(
                 plant=plant,
                 law=law,
                 response=drag_response,
-                band=band,
+                band_spectrum=band_spectrum,
                 pole_derivatives={
-                    mode_number: band(derivative_rows)
+                    mode_number: band_spectrum(derivative_rows)
                     for mode_number, derivative_rows in drag_torque.pole_derivatives.items()
                 },
-                external_derivatives=band(drag_torque.external_derivatives),
-                ln_density_derivative=band(drag_torque.ln_density_derivative),
-                delay_derivative=band(drag_torque.delay_derivative),
-                law_derivatives=band(drag_torque.law_derivatives),
+                external_damping_derivatives=band_spectrum(
+                    drag_torque.external_damping_derivatives
+                ),
+                ln_density_derivative=band_spectrum(drag_torque.ln_density_derivative),
+                delay_derivative=band_spectrum(drag_torque.delay_derivative),
+                law_derivatives=band_spectrum(drag_torque.law_derivatives),
                 speed_m_s=drag_torque.speed_m_s,
                 top_speed_m_s=drag_torque.top_speed_m_s,
             ),
@@ -564,11 +589,12 @@ class Comparison:
         effect_spectra : ndarray of complex, shape (c, K)
             Torque spectra of effects of unknown size.
         """
-        hum_spectra = self.decays.hum([hum_spectra.frequency_hz for hum_spectra in self.hum])
-        drift_spectrum = _drift_spectrum(self.samples)[None, self.bins]
+        hum_spectra = self.decay_spectra.hum([hum_spectra.frequency_hz for hum_spectra in self.hum])
+        drift_spectrum = _drift_spectrum(self.sample_count)[None, self.band_bins]
         impact_spectra = drift_spectrum[:0] if self.impact_spectra is None else self.impact_spectra
         decay_columns = [
-            decay_spectra.spectra(poles) for decay_spectra in (self.decays, *self.later_decays)
+            decay_group.spectra(poles)
+            for decay_group in (self.decay_spectra, *self.later_decay_spectra)
         ]
         return np.concatenate(
             [*decay_columns, hum_spectra, impact_spectra, drift_spectrum, effect_spectra]
@@ -593,9 +619,9 @@ class Comparison:
         -------
         ndarray of complex, shape (k, K)
         """
-        total_gradient = self.decays.gradient(poles, amplitudes)
+        total_gradient = self.decay_spectra.gradient(poles, amplitudes)
         amplitudes_per_decay = count_decay_spectra(poles)
-        for decay_number, later_decay in enumerate(self.later_decays, start=1):
+        for decay_number, later_decay in enumerate(self.later_decay_spectra, start=1):
             total_gradient += later_decay.gradient(
                 poles, amplitudes[decay_number * amplitudes_per_decay :]
             )
@@ -607,22 +633,24 @@ class Comparison:
         The residual at the filled ticks then is 0. After convergence of the fit, the cost has the
         same minimum as the cost of the known samples alone.
         """
-        known_mask = self.measurement.torque_known
-        if known_mask.all():
+        is_torque_known = self.measurement.torque_known
+        if is_torque_known.all():
             return self
-        filled_nm = self.measurement.torque_nm.copy()
-        filled_nm[~known_mask] = (
-            self.removed_in_gaps_nm
-            + self.prediction.torque_at_fine_samples(
-                plant, self.decimation.downsampling_factor, self._decimated_indices(~known_mask)
+        filled_torque_nm = self.measurement.torque_nm.copy()
+        filled_torque_nm[~is_torque_known] = (
+            self.removed_torque_in_gaps_nm
+            + self.torque_predictor.torque_at_fine_samples(
+                plant,
+                self.decimation.downsampling_factor,
+                self._decimated_indices(~is_torque_known),
             )[0]
         )
-        decimated_nm = self.decimation.apply(filled_nm)
-        decimated_nm[self.retained] -= self.removed_nm
-        return replace(self, torque_nm=decimated_nm)
+        decimated_torque_nm = self.decimation.apply(filled_torque_nm)
+        decimated_torque_nm[self.retained_samples] -= self.removed_torque_nm
+        return replace(self, torque_nm=decimated_torque_nm)
 
     def gradient_at_unknown_torque(
-        self, plant: Plant, wrt: tuple[str, ...]
+        self, plant: Plant, gradient_parameters: tuple[str, ...]
     ) -> NDArray[np.complex128]:
         """Return the spectra of the predicted torque's derivatives at unmeasured ticks, (k, K).
 
@@ -632,38 +660,45 @@ class Comparison:
         ----------
         plant : Plant
             Beam and rig.
-        wrt : tuple of str
+        gradient_parameters : tuple of str
             Names of the k parameters with respect to which the torque is differentiated.
         """
-        is_unknown = ~self.measurement.torque_known
-        unknown_gradient = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
-        if is_unknown.any():
-            _, gradient = self.prediction.torque_at_fine_samples(
-                plant, self.decimation.downsampling_factor, self._decimated_indices(is_unknown), wrt
+        is_torque_unknown = ~self.measurement.torque_known
+        unknown_gradient = np.zeros(
+            (len(gradient_parameters), self.frequency_hz.size), dtype=np.complex128
+        )
+        if is_torque_unknown.any():
+            _, gradient = self.torque_predictor.torque_at_fine_samples(
+                plant,
+                self.decimation.downsampling_factor,
+                self._decimated_indices(is_torque_unknown),
+                gradient_parameters,
             )
             for spectrum_row, derivative_nm in zip(unknown_gradient, gradient, strict=True):
-                unknown_nm = np.zeros(is_unknown.size)
-                unknown_nm[is_unknown] = derivative_nm
-                spectrum_row[:] = self.spectrum(self.decimation.apply(unknown_nm)[self.retained])
+                derivative_at_ticks_nm = np.zeros(is_torque_unknown.size)
+                derivative_at_ticks_nm[is_torque_unknown] = derivative_nm
+                spectrum_row[:] = self.spectrum(
+                    self.decimation.apply(derivative_at_ticks_nm)[self.retained_samples]
+                )
         return unknown_gradient
 
-    def _decimated_indices(self, is_marked: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def _decimated_indices(self, is_selected_tick: NDArray[np.bool_]) -> NDArray[np.intp]:
         """Return the full-rate indices of marked ticks, counted from the first decimated sample.
 
-        `is_marked` is a mask over the ticks of the record.
+        `is_selected_tick` is a mask over the ticks of the record.
         """
         return (
-            np.flatnonzero(is_marked)
+            np.flatnonzero(is_selected_tick)
             + self.decimation.half_length_samples * self.decimation.downsampling_factor
         )
 
 
 @lru_cache(maxsize=2)
-def _drift_spectrum(samples: int) -> NDArray[np.complex128]:
+def _drift_spectrum(sample_count: int) -> NDArray[np.complex128]:
     """Return the spectrum of a linear drift from -0.5 to 0.5 over all samples.
 
     The array is cached and read-only.
     """
-    spectrum: NDArray[np.complex128] = np.fft.rfft(np.linspace(-0.5, 0.5, samples))
+    spectrum: NDArray[np.complex128] = np.fft.rfft(np.linspace(-0.5, 0.5, sample_count))
     spectrum.flags.writeable = False
     return spectrum

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Measurement
 
-_START_TOLERANCE_S: Final = 1e-7
+_IMPACT_START_TOLERANCE_S: Final = 1e-7
 """Rounding tolerance in seconds: a sample at most this long before an impact already belongs to the
 free decay after it."""
 
@@ -64,9 +64,9 @@ class RecordedImpact:
         Uncertainty of the beginning.
     poles_rad_s : tuple of complex
         Poles of the ringing modes: the upper pole of a conjugate pair, or a real pole.
-    sizes : tuple of float
+    component_amplitudes : tuple of float
         Estimated amplitude of each row of `unit_torques`; empty before they are estimated.
-    largest_nm : float
+    largest_torque_nm : float
         Largest torque within one second from the beginning.
     """
 
@@ -74,26 +74,26 @@ class RecordedImpact:
     end_s: float
     start_uncertainty_s: float
     poles_rad_s: tuple[complex, ...]
-    sizes: tuple[float, ...] = ()
-    largest_nm: float = 0.0
+    component_amplitudes: tuple[float, ...] = ()
+    largest_torque_nm: float = 0.0
 
-    def decays(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def free_decays(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the free decays of all modes after the impact, shape (d, n).
 
         The rows come in pairs: a real decay of unit amplitude, and this decay multiplied by the
         time in seconds since the impact. The second row allows for a small error of the pole. The n
         times are relative to the record's first tick.
         """
-        since_s = time_s - self.start_s
-        has_begun = since_s > -_START_TOLERANCE_S
-        since_s = np.where(has_begun, since_s, 0.0)
+        time_since_start_s = time_s - self.start_s
+        has_begun = time_since_start_s > -_IMPACT_START_TOLERANCE_S
+        time_since_start_s = np.where(has_begun, time_since_start_s, 0.0)
         decay_rows = []
         for pole_rad_s in self.poles_rad_s:
-            complex_decay = np.where(has_begun, np.exp(pole_rad_s * since_s), 0.0)
+            complex_decay = np.where(has_begun, np.exp(pole_rad_s * time_since_start_s), 0.0)
             for real_decay in (complex_decay.real, complex_decay.imag)[
                 : 1 + (pole_rad_s.imag != 0)
             ]:
-                decay_rows += [real_decay, real_decay * since_s]
+                decay_rows += [real_decay, real_decay * time_since_start_s]
         return np.array(decay_rows).reshape(len(decay_rows), time_s.size)
 
     def unit_torques(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
@@ -104,27 +104,32 @@ class RecordedImpact:
         to the record's first tick.
         """
         half_period_s = 0.5 / rate_hz
-        in_contact = (time_s > self.start_s - half_period_s) & (time_s < self.end_s - half_period_s)
-        contact_indices = np.flatnonzero(in_contact)
-        single_samples = np.zeros((contact_indices.size, time_s.size))
-        single_samples[np.arange(contact_indices.size), contact_indices] = 1.0
-        return np.concatenate([self.decays(time_s), single_samples])
+        is_in_contact = (time_s > self.start_s - half_period_s) & (
+            time_s < self.end_s - half_period_s
+        )
+        contact_indices = np.flatnonzero(is_in_contact)
+        single_sample_pulses = np.zeros((contact_indices.size, time_s.size))
+        single_sample_pulses[np.arange(contact_indices.size), contact_indices] = 1.0
+        return np.concatenate([self.free_decays(time_s), single_sample_pulses])
 
     def torque(
-        self, time_s: NDArray[np.float64], grid_s: NDArray[np.float64], rate_hz: float
+        self, time_s: NDArray[np.float64], sample_times_s: NDArray[np.float64], rate_hz: float
     ) -> NDArray[np.float64]:
         """Return the estimated torque of the impact in N·m at given times, shape (n,).
 
-        The times are relative to the record's first tick. `grid_s` and `rate_hz` are the times and
-        the sampling rate of the samples for which `sizes` was estimated.
+        The times are relative to the record's first tick. `sample_times_s` and `rate_hz` are the
+        times and the sampling rate of the samples for which `component_amplitudes` was estimated.
         """
-        if not self.sizes:
+        if not self.component_amplitudes:
             return np.zeros(time_s.size)
-        decays = self.decays(time_s)
-        amplitudes = np.array(self.sizes)
-        contact_nm = amplitudes[len(decays) :] @ self.unit_torques(grid_s, rate_hz)[len(decays) :]
-        decay_nm: NDArray[np.float64] = amplitudes[: len(decays)] @ decays
-        return decay_nm + np.interp(time_s, grid_s, contact_nm)
+        free_decays = self.free_decays(time_s)
+        amplitudes = np.array(self.component_amplitudes)
+        contact_torque_nm = (
+            amplitudes[len(free_decays) :]
+            @ self.unit_torques(sample_times_s, rate_hz)[len(free_decays) :]
+        )
+        decay_torque_nm: NDArray[np.float64] = amplitudes[: len(free_decays)] @ free_decays
+        return decay_torque_nm + np.interp(time_s, sample_times_s, contact_torque_nm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +233,7 @@ class Measurement:
             torque_extremes=record.torque_extremes,
         )
 
-    def check(self, highest_hz: float) -> None:
+    def check_channels(self, highest_hz: float) -> None:
         """Raise an error if the measurement cannot be used in a band that ends at `highest_hz`.
 
         Raises
@@ -244,27 +249,27 @@ class Measurement:
                     f"{self.name}: angle, torque and their masks hold {tick_count} and "
                     f"{len(channel_array)} values, but must be of one length."
                 )
-        for channel, unit_name, channel_values, known_mask in (
+        for channel, unit_name, channel_values, is_known in (
             ("angle", "rad", self.angle_rad, self.angle_known),
             ("torque", "N·m", self.torque_nm, self.torque_known),
         ):
-            bad_indices = np.flatnonzero(known_mask & ~np.isfinite(channel_values))
+            bad_indices = np.flatnonzero(is_known & ~np.isfinite(channel_values))
             if bad_indices.size:
                 raise MeasurementError(
                     f"{self.name}: the {channel} is {channel_values[bad_indices[0]]} {unit_name} "
                     f"at tick {bad_indices[0]} and not finite at {bad_indices.size} of "
                     f"{tick_count} ticks; mask them as unknown or record the session again."
                 )
-            complaint = unknown_fraction_message(
-                f"the {channel}", int(np.count_nonzero(~known_mask)), tick_count
+            error_text = unknown_fraction_message(
+                f"the {channel}", int(np.count_nonzero(~is_known)), tick_count
             )
-            if complaint:
-                raise MeasurementError(f"{self.name}: {complaint}")
-        for channel, known_mask, allowed_s in (
+            if error_text:
+                raise MeasurementError(f"{self.name}: {error_text}")
+        for channel, is_known, allowed_s in (
             ("angle", self.angle_known, MAX_GAP_S),
             ("torque", self.torque_known, MAX_TORQUE_GAP_S),
         ):
-            gap_ticks, gap_start = longest_run(~known_mask)
+            gap_ticks, gap_start = longest_run(~is_known)
             if gap_ticks > allowed_s * self.rate_hz:
                 raise MeasurementError(
                     f"{self.name}: the {channel} is missing or flagged for {gap_ticks} ticks from "
@@ -303,7 +308,7 @@ class Measurement:
             First tick of each gap, and the first tick after it at which the filters of the torque
             channel have settled.
         """
-        longest_ticks = MAX_GAP_PERIODS / highest_hz * self.rate_hz
+        longest_gap_ticks = MAX_GAP_PERIODS / highest_hz * self.rate_hz
         settling_s = abs(self.delay_s) + _FILTER_SETTLING_TIME_CONSTANTS * (
             self.filter_time_constant_s + self.second_order_filter_time_constant_s
         )
@@ -311,7 +316,7 @@ class Measurement:
         return tuple(
             (int(gap_start), min(int(gap_end) + settling_ticks, len(self.angle_rad)))
             for gap_start, gap_end in zip(*runs_of_true(~self.angle_known), strict=True)
-            if gap_end - gap_start > longest_ticks
+            if gap_end - gap_start > longest_gap_ticks
         )
 
     def without_torque_in(self, tick_ranges: Iterable[tuple[int, int]]) -> Measurement:
@@ -322,13 +327,13 @@ class Measurement:
         tick_ranges : iterable of (int, int)
             First tick of each range, and the first tick after it.
         """
-        known_mask = self.torque_known.copy()
+        is_torque_known = self.torque_known.copy()
         for first_tick, end_tick in tick_ranges:
-            known_mask[first_tick:end_tick] = False
-        return replace(self, torque_known=known_mask)
+            is_torque_known[first_tick:end_tick] = False
+        return replace(self, torque_known=is_torque_known)
 
     @property
-    def nominal(self) -> Plant:
+    def nominal_plant(self) -> Plant:
         """Return the beam and rig with the properties that the session file states, undamped."""
         return Plant(
             beam=self.beam,
@@ -345,7 +350,7 @@ class Measurement:
         """Return the fraction of the ticks at which the torque is known."""
         return float(np.mean(self.torque_known))
 
-    def angle_from_rest(self, highest_hz: float) -> NDArray[np.float64]:
+    def angle_from_rest_rad(self, highest_hz: float) -> NDArray[np.float64]:
         """Return the motor angle in rad relative to its rest position, gaps interpolated, (n,).
 
         `highest_hz` is the highest frequency that the angle contains. If the rest position is

@@ -42,15 +42,15 @@ def findings(
     frequency.
     """
     measurement = candidate_set.comparison.measurement
-    model_independent = (
+    model_independent_findings = (
         *candidate_set.misread_findings,
         *clipping_findings(measurement),
         *standstill_findings(measurement),
     )
     if candidate_set.misread_findings:
-        return model_independent
+        return model_independent_findings
     all_findings = (
-        *model_independent,
+        *model_independent_findings,
         *_hum_findings(candidate_set),
         *_drag_findings(candidate_set),
         *map(_force_finding, forces),
@@ -225,15 +225,15 @@ def _equivalent_causes(candidate_set: CandidateSet, setting_name: Setting) -> st
         math.log(fit.plant.beam.density_over_stiffness / stated_beam.density_over_stiffness) / 4
     )
     stiffness_n_m2 = fit.plant.beam.bending_stiffness_n_m2
-    std = fit.std["bending_stiffness_n_m2"] or 0.0
+    stiffness_std = fit.std["bending_stiffness_n_m2"] or 0.0
     # A small mass at the tip shifts all modes alike, and the torque by a quarter of that shift.
-    unexplained_change = (
+    unexplained_log_stiffness = (
         math.log(stiffness_n_m2 / stated_beam.bending_stiffness_n_m2) + tip_mass_effect
     )
     if (
         fit.plant.tip_mass_kg
         or tip_mass_effect <= 0
-        or abs(unexplained_change) > SIGNIFICANT_STD * std / stiffness_n_m2
+        or abs(unexplained_log_stiffness) > SIGNIFICANT_STD * stiffness_std / stiffness_n_m2
     ):
         return ""
     mass_g = 1e3 * tip_mass_effect * stated_beam.density_kg_per_m * stated_beam.length_m
@@ -268,7 +268,7 @@ def _initial_ringing_findings(candidate_set: CandidateSet, headline: Headline) -
 
 def _stated_value(candidate_set: CandidateSet, setting_name: Setting) -> float:
     """Return the value in SI units that the session file states for a setting."""
-    return candidate_set.comparison.measurement.nominal.parameters[setting_name]
+    return candidate_set.comparison.measurement.nominal_plant.parameters[setting_name]
 
 
 # Disturbances, forces, and what remains
@@ -377,7 +377,7 @@ def unexplained_residual_finding(
 _DRIFT_SEGMENT_COUNT: Final = 16
 """Number of segments of a record whose mean residual torques are compared."""
 
-_MIN_SCATTER_RATIO: Final = 10.0
+_MIN_DRIFT_SCATTER_RATIO: Final = 10.0
 """Minimum scatter of the mean residual torques that is reported as drift, relative to the scatter
 due to noise."""
 
@@ -388,8 +388,8 @@ def _torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
     It is the range of the mean residuals of segments of the record.
     """
     comparison = candidate_set.comparison
-    predicted_nm, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
-    residual_nm = comparison.torque_nm[comparison.retained] - predicted_nm
+    predicted_nm, _ = comparison.torque_predictor.torque(candidate_set.best.fit.plant)
+    residual_nm = comparison.torque_nm[comparison.retained_samples] - predicted_nm
     segment_length = residual_nm.size // _DRIFT_SEGMENT_COUNT
     segment_means_nm = (
         residual_nm[: _DRIFT_SEGMENT_COUNT * segment_length]
@@ -397,13 +397,13 @@ def _torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
         .mean(axis=1)
     )
     # Expected scatter for white noise with the power of the band's upper half.
-    upper_half_power = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
+    noise_power_in_upper_half = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
     noise_std_nm = math.sqrt(
-        float(np.median(upper_half_power)) / comparison.samples / segment_length
+        float(np.median(noise_power_in_upper_half)) / comparison.sample_count / segment_length
     )
     return (
         float(np.ptp(segment_means_nm))
-        if float(segment_means_nm.std()) > _MIN_SCATTER_RATIO * noise_std_nm
+        if float(segment_means_nm.std()) > _MIN_DRIFT_SCATTER_RATIO * noise_std_nm
         else 0.0
     )
 
@@ -411,7 +411,7 @@ def _torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
 def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     """Yield findings of torque-sensor drift and of narrow-band disturbances of the torque."""
     comparison = candidate_set.comparison
-    duration_s = comparison.samples / comparison.decimation.rate_hz
+    duration_s = comparison.sample_count / comparison.decimation.rate_hz
     drift_nm = _torque_zero_drift_nm(candidate_set)
     if drift_nm > 0:
         yield _drift_finding(drift_nm)
@@ -450,15 +450,15 @@ def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
         )
 
 
-def _drift_finding(size_nm: float) -> Finding:
-    """Return the finding of a zero drift of the torque sensor by `size_nm` newton metres."""
+def _drift_finding(drift_nm: float) -> Finding:
+    """Return the finding of a zero drift of the torque sensor by `drift_nm` newton metres."""
     return Finding(
         kind="sensor drift",
         sentence=(
-            f"The zero of the torque sensor drifts by about {1e3 * size_nm:.2g} mN·m over the "
+            f"The zero of the torque sensor drifts by about {1e3 * drift_nm:.2g} mN·m over the "
             "record, more slowly than the beam responds."
         ),
-        value=size_nm,
+        value=drift_nm,
         unit="N·m",
     )
 

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 _TESTED_STRUCTURES: Final = ("III", "VI", "VII")
 """Names of the structures with which drag is tested: those with internal and external damping."""
 
-_FIRST_ORDER_BIC_MARGIN: Final = 6.0
+_FIRST_ORDER_PREDICTION_BIC_MARGIN: Final = 6.0
 """Amount by which the predicted BIC with drag may exceed the lowest BIC for drag to be fitted. The
 prediction is of first order, and has an error."""
 
@@ -61,7 +61,7 @@ _MAX_DRAG_COMPUTATIONS: Final = 15
 _SHORT_DESCENT_EVALUATIONS: Final = 12
 """Maximum number of evaluations of a descent before the drag torque is recomputed."""
 
-_EARLY_EVALUATIONS: Final = 4
+_EVALUATIONS_BEFORE_GIVING_UP: Final = 4
 """Number of evaluations after which the descent of a structure with drag ends if its cost is still
 far above that of the best structure."""
 
@@ -72,10 +72,10 @@ _GIVE_UP_DEVIANCE: Final = 50.0
 """Deviance, relative to that of the converged structure, above which the descent of another
 structure with drag ends early."""
 
-_COST_TOLERANCE: Final = 2.0
+_DRAG_COST_TOLERANCE: Final = 2.0
 """Predicted reduction of the cost below which the drag torque is not recomputed."""
 
-_ROUGH_COST_TOLERANCE: Final = 500.0
+_ROUGH_DRAG_COST_TOLERANCE: Final = 500.0
 """Predicted reduction of the cost below which the drag torque is not recomputed in the first, rough
 fit.
 
@@ -91,13 +91,13 @@ before reduced the cost by no more than twice as much.
 Where external damping has vanished or acts as an inertia, each step along its order predicts a
 reduction that the recomputed drag does not confirm."""
 
-_FIRST_STRUCTURE: Final = "III"
+_FIRST_FITTED_STRUCTURE: Final = "III"
 """Structure of the first fit with drag: both dampings with order 1."""
 
 _FREEST_STRUCTURE: Final = "VI"
 """Structure with both dampings and free orders."""
 
-_MIN_STD_OF_CONSTANT_LAW: Final = 0.1
+_MIN_DRAG_STD_FOR_CONSTANT_LAW: Final = 0.1
 """Relative standard deviation of C_D d above which the drag law is a constant.
 
 The drag coefficient of a cylinder falls with the speed. A constant is wrong by up to 7 % on rods
@@ -105,7 +105,7 @@ and wires between 0.2 and 2 mm, and external damping compensates for the error. 
 certain, the law gets its second coefficient, even if that is not significant: otherwise the
 interval would be too narrow."""
 
-_LOWEST_RELATIVE_SPEED: Final = 0.02
+_LOWEST_REPORTED_RELATIVE_SPEED: Final = 0.02
 """Lowest speed at which C_D d is reported, relative to the highest speed: below it the record
 contains no information."""
 
@@ -124,40 +124,49 @@ def refit_with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
 
 def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
     """Return all damping structures fitted with air drag, or the given set if its BIC is lower."""
-    lead_candidate = next(
-        (c for c in candidate_set.candidates if c.structure.name == _FIRST_STRUCTURE), None
+    first_structure_candidate = next(
+        (c for c in candidate_set.candidates if c.structure.name == _FIRST_FITTED_STRUCTURE), None
     )
-    first_start = (
-        None if lead_candidate is None else _first_order_start(candidate_set, lead_candidate)
+    first_fit_start = (
+        None
+        if first_structure_candidate is None
+        else _first_order_start(candidate_set, first_structure_candidate)
     )
-    if first_start is None:
+    if first_fit_start is None:
         return candidate_set
     rough_fit = _converged_drag_fit(
-        candidate_set, first_start, STRUCTURES[_FIRST_STRUCTURE], tolerance=_ROUGH_COST_TOLERANCE
+        candidate_set,
+        first_fit_start,
+        STRUCTURES[_FIRST_FITTED_STRUCTURE],
+        cost_tolerance=_ROUGH_DRAG_COST_TOLERANCE,
     )
     if rough_fit is None:
         return candidate_set
     # The freest structure starts from this fit: its fit without drag may be far off.
-    start_comparison, next_start = (
+    start_comparison, next_fit_start = (
         rough_fit.objective.comparison,
         _DragFitStart.from_refit(rough_fit),
     )
-    for structure_name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
+    for structure_name in (_FREEST_STRUCTURE, _FIRST_FITTED_STRUCTURE):
         drag_fit = _converged_drag_fit(
-            candidate_set, next_start, STRUCTURES[structure_name], start_comparison=start_comparison
+            candidate_set,
+            next_fit_start,
+            STRUCTURES[structure_name],
+            start_comparison=start_comparison,
         )
         if drag_fit is not None:
             break
         # A converged fit of the same structure is better than the rough one by far less than this.
-        if _bic_under_own_noise(rough_fit) > candidate_set.bic + 2 * _ROUGH_COST_TOLERANCE:
+        if _bic_under_own_noise(rough_fit) > candidate_set.bic + 2 * _ROUGH_DRAG_COST_TOLERANCE:
             return candidate_set
     else:
         return candidate_set
-    set_with_drag = _fit_all_structures(candidate_set, drag_fit)
-    assert set_with_drag.drag is not None
+    candidate_set_with_drag = _fit_all_structures(candidate_set, drag_fit)
+    assert candidate_set_with_drag.drag is not None
     return (
-        set_with_drag
-        if set_with_drag.drag.drag_m > 0 and set_with_drag.bic < candidate_set.bic
+        candidate_set_with_drag
+        if candidate_set_with_drag.drag.drag_m > 0
+        and candidate_set_with_drag.bic < candidate_set.bic
         else candidate_set
     )
 
@@ -208,7 +217,7 @@ def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
         if (
             drag_m > 0
             and candidate.bic - deviance_reduction + math.log(candidate.compared_value_count)
-            < best_candidate.bic + _FIRST_ORDER_BIC_MARGIN
+            < best_candidate.bic + _FIRST_ORDER_PREDICTION_BIC_MARGIN
         ):
             return True
     return False
@@ -222,7 +231,9 @@ def small_drag_spectrum(
     `measured_modes` replace those of the plant, as for `DragResponse`.
     """
     drag_response = comparison.drag_response(plant, measured_modes)
-    return comparison.spectrum(drag_response.first_order_torque()[None, comparison.retained])
+    return comparison.spectrum(
+        drag_response.first_order_torque()[None, comparison.retained_samples]
+    )
 
 
 def _first_order_drag(refit: Refit) -> tuple[float, float]:
@@ -233,11 +244,11 @@ def _first_order_drag(refit: Refit) -> tuple[float, float]:
     (drag_spectrum,), residual = refit.unexplained_spectra(
         small_drag_spectrum(refit.objective.comparison, refit.plant)
     )
-    squared_length = float(np.vdot(drag_spectrum, drag_spectrum).real)
-    if squared_length <= 0:
+    squared_spectrum_norm = float(np.vdot(drag_spectrum, drag_spectrum).real)
+    if squared_spectrum_norm <= 0:
         return 0.0, 0.0
     projection = float(np.vdot(drag_spectrum, residual).real)
-    return -projection / squared_length, projection**2 / squared_length
+    return -projection / squared_spectrum_norm, projection**2 / squared_spectrum_norm
 
 
 def _first_order_start(candidate_set: CandidateSet, candidate: Candidate) -> _DragFitStart | None:
@@ -262,17 +273,17 @@ def _converged_drag_fit(
     fit_start: _DragFitStart,
     structure: Structure,
     *,
-    tolerance: float = _COST_TOLERANCE,
+    cost_tolerance: float = _DRAG_COST_TOLERANCE,
     start_comparison: Comparison | None = None,
 ) -> Refit | None:
     """Return a refit of one damping structure with air drag whose torque has converged.
 
     The fit starts from `fit_start`, and has converged if a further step would reduce the cost by
-    less than `tolerance`. `start_comparison` is the comparison with the drag of the start, if it
-    has been computed. Return None if the drag is negative, is unstable or does not converge.
+    less than `cost_tolerance`. `start_comparison` is the comparison with the drag of the start, if
+    it has been computed. Return None if the drag is negative, is unstable or does not converge.
     """
     unknowns = candidate_set.unknowns(structure)
-    x = unknowns.vector(fit_start.plant)
+    vector_of_unknowns = unknowns.vector(fit_start.plant)
     law, noise, has_two_coefficients = (
         fit_start.law,
         fit_start.noise,
@@ -280,12 +291,12 @@ def _converged_drag_fit(
     )
     comparison, is_rough_fit, cost_reduction = (
         start_comparison,
-        tolerance > _COST_TOLERANCE,
+        cost_tolerance > _DRAG_COST_TOLERANCE,
         math.inf,
     )
     for _ in range(_MAX_DRAG_COMPUTATIONS):
         if comparison is None:
-            plant = unknowns.plant(x)
+            plant = unknowns.plant(vector_of_unknowns)
             # With drag the plant is different, and so is the torque of the incoherent angle.
             try:
                 comparison = candidate_set.comparison.recompute_incoherent_torque(
@@ -295,9 +306,9 @@ def _converged_drag_fit(
                 return None
         drag_expansion = comparison.drag
         assert drag_expansion is not None
-        descent = partial(Refit.descend, comparison, unknowns, noise=noise)
-        start_refit = descent(
-            x,
+        descend_with_drag = partial(Refit.descend, comparison, unknowns, noise=noise)
+        start_refit = descend_with_drag(
+            vector_of_unknowns,
             torque_spectra=drag_expansion.law_derivatives[: 1 + has_two_coefficients],
             max_evaluations=1,
         )
@@ -305,26 +316,26 @@ def _converged_drag_fit(
         if (
             has_two_coefficients
             or is_rough_fit
-            or _relative_drag_std(refit) > _MIN_STD_OF_CONSTANT_LAW
+            or _relative_drag_std(refit) > _MIN_DRAG_STD_FOR_CONSTANT_LAW
         ):
             last_reduction, cost_reduction = (
                 cost_reduction,
                 start_refit.cost - max(start_refit.predicted_cost, refit.cost),
             )
             if (
-                cost_reduction < tolerance
+                cost_reduction < cost_tolerance
                 or last_reduction / 2 < cost_reduction < _STAGNATION_COST_REDUCTION
             ):
                 return start_refit
         else:
             # Not before: a second number would compensate for wrong damping of the beam.
             has_two_coefficients = True
-            refit = descent(
+            refit = descend_with_drag(
                 refit.x,
                 torque_spectra=drag_expansion.law_derivatives,
                 max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             )
-        x, law, noise = refit.x, _law_at_minimum(refit), refit.residual_noise()
+        vector_of_unknowns, law, noise = refit.x, _law_at_minimum(refit), refit.residual_noise()
         if law.at(drag_expansion.speed_m_s) <= 0:
             return None
         comparison = None
@@ -342,41 +353,41 @@ def _law_at_minimum(refit: Refit) -> DragLaw:
 
     It is the law for which the drag torque was computed, plus the estimated change.
     """
-    expansion = refit.objective.comparison.drag
-    assert expansion is not None
-    law_change = refit.amplitudes()[0].tolist()
-    decreasing_part = expansion.law.decreasing_part + (
-        law_change[1] if len(law_change) > 1 else 0.0
+    drag_expansion = refit.objective.comparison.drag
+    assert drag_expansion is not None
+    law_coefficient_changes = refit.amplitudes()[0].tolist()
+    decreasing_part = drag_expansion.law.decreasing_part + (
+        law_coefficient_changes[1] if len(law_coefficient_changes) > 1 else 0.0
     )
-    return DragLaw(expansion.law.constant_m + law_change[0], decreasing_part)
+    return DragLaw(drag_expansion.law.constant_m + law_coefficient_changes[0], decreasing_part)
 
 
 def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> CandidateSet:
     """Fit all structures with the drag torque of a converged fit, and estimate the drag."""
-    set_with_drag = replace(
+    candidate_set_with_drag = replace(
         candidate_set,
         comparison=converged_fit.objective.comparison,
         effect_spectra=converged_fit.effect_spectra,
         noise=converged_fit.residual_noise(),
     )
-    converged_cost = set_with_drag.descend_from_vector(
+    converged_cost = candidate_set_with_drag.descend_from_vector(
         converged_fit.objective.unknowns, converged_fit.x, 1
     ).cost
     cost_limit = converged_cost * math.exp(
         _GIVE_UP_DEVIANCE / candidate_set.best.compared_value_count
     )
     short_descents = []
-    for candidate_without in candidate_set.candidates:
-        unknowns = set_with_drag.unknowns(candidate_without.structure)
+    for candidate_without_drag in candidate_set.candidates:
+        unknowns = candidate_set_with_drag.unknowns(candidate_without_drag.structure)
         refit = Refit.descend(
-            set_with_drag.comparison,
+            candidate_set_with_drag.comparison,
             unknowns,
             unknowns.vector(converged_fit.plant),
-            set_with_drag.noise,
-            set_with_drag.effect_spectra,
+            candidate_set_with_drag.noise,
+            candidate_set_with_drag.effect_spectra,
             max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             relative_tolerance=MISSED_COST_FRACTION,
-            hopeless=(_EARLY_EVALUATIONS, cost_limit),
+            hopeless=(_EVALUATIONS_BEFORE_GIVING_UP, cost_limit),
         )
         short_descents.append((refit.candidate(), refit))
     candidates = [
@@ -385,8 +396,8 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
         else candidate
         for candidate, refit in short_descents
     ]
-    refitted = set_with_drag.with_candidates(candidates).cross_check()
-    return replace(refitted, drag=_drag_estimate(refitted))
+    refitted_candidate_set = candidate_set_with_drag.with_candidates(candidates).cross_check()
+    return replace(refitted_candidate_set, drag=_drag_estimate(refitted_candidate_set))
 
 
 def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
@@ -398,23 +409,30 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
     refit = candidate_set.refit(freest_candidate)
     law, covariance = _law_at_minimum(refit), refit.amplitude_covariance()[1]
     covariance = covariance * freest_candidate.fit.cost / freest_candidate.fit.degrees_of_freedom
-    expansion = refit.objective.comparison.drag
-    assert expansion is not None
-    speed_m_s = expansion.speed_m_s
-    law_weights = np.ones(1)
+    drag_expansion = refit.objective.comparison.drag
+    assert drag_expansion is not None
+    pivot_speed_m_s = drag_expansion.speed_m_s
+    law_coefficient_weights = np.ones(1)
     if len(covariance) > 1:
-        pivot_weight = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
-        top_speed_m_s = expansion.top_speed_m_s
-        speed_m_s = min(
-            max(float(pivot_weight**-1.5), _LOWEST_RELATIVE_SPEED * top_speed_m_s), top_speed_m_s
+        pivot_coefficient_weight = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
+        top_speed_m_s = drag_expansion.top_speed_m_s
+        pivot_speed_m_s = min(
+            max(
+                float(pivot_coefficient_weight**-1.5),
+                _LOWEST_REPORTED_RELATIVE_SPEED * top_speed_m_s,
+            ),
+            top_speed_m_s,
         )
-        law_weights = np.array([1.0, speed_m_s ** (-2 / 3)])
-    drag_m, std = law.at(speed_m_s), math.sqrt(float(law_weights @ covariance @ law_weights))
+        law_coefficient_weights = np.array([1.0, pivot_speed_m_s ** (-2 / 3)])
+    drag_m, std = (
+        law.at(pivot_speed_m_s),
+        math.sqrt(float(law_coefficient_weights @ covariance @ law_coefficient_weights)),
+    )
     return DragEstimate(
         drag_m=drag_m,
         std_m=std,
         interval_95_m=(max(drag_m - NORMAL_95 * std, 0.0), drag_m + NORMAL_95 * std),
-        pivot_speed_m_s=speed_m_s,
+        pivot_speed_m_s=pivot_speed_m_s,
         law=law,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
     )
@@ -470,59 +488,61 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
         : len(drag_estimate.covariance)
     ]
     covariance = np.array(drag_estimate.covariance)
-    estimates = []
+    damping_estimates = []
     for mode_estimate in fit.modes:
         if mode_estimate.number not in _REPORTED_MODE_NUMBERS or mode_estimate.frequency_hz <= 0:
             continue
         for relative_amplitude in _RELATIVE_TIP_AMPLITUDES:
             tip_amplitude_m = relative_amplitude * fit.plant.beam.length_m
-            ratio_by_law = damping_ratio_by_drag_law(
+            damping_ratio_by_law = damping_ratio_per_law_coefficient(
                 mode_estimate.number,
                 2 * math.pi * mode_estimate.frequency_hz,
                 tip_amplitude_m,
                 fit.plant.beam.density_kg_per_m,
             )[: law_coefficients.size]
             ratio_variance = mode_estimate.damping_ratio_std**2 + float(
-                ratio_by_law @ covariance @ ratio_by_law
+                damping_ratio_by_law @ covariance @ damping_ratio_by_law
             )
-            estimates.append(
+            damping_estimates.append(
                 DampingAtAmplitude(
                     mode=mode_estimate.number,
                     tip_amplitude_m=tip_amplitude_m,
                     damping_ratio=mode_estimate.damping_ratio
-                    + float(ratio_by_law @ law_coefficients),
+                    + float(damping_ratio_by_law @ law_coefficients),
                     std=math.sqrt(ratio_variance),
                 )
             )
-    return tuple(estimates)
+    return tuple(damping_estimates)
 
 
-def damping_ratio_by_drag_law(
-    mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
+def damping_ratio_per_law_coefficient(
+    mode_number: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
     """Return the damping ratio due to air drag per unit of each coefficient of a `DragLaw`, (2,).
 
     It is that of one mode in free vibration, with a given amplitude of the tip in metres.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
-    relative_shape = np.abs(mode_shape(mode, 0.5 * (nodes + 1)) / mode_shape(mode, 1.0))
+    relative_shape = np.abs(
+        mode_shape(mode_number, 0.5 * (nodes + 1)) / mode_shape(mode_number, 1.0)
+    )
     tip_speed_m_s = tip_amplitude_m * omega_rad_s
     damping_ratios = []
     for speed_exponent in _SPEED_EXPONENTS:
-        time_mean = (
+        mean_over_time = (
             2
             / math.sqrt(math.pi)
             * math.gamma(speed_exponent / 2 + 1)
             / math.gamma(speed_exponent / 2 + 1.5)
         )
-        shape_mean = float(weights @ relative_shape ** (speed_exponent + 1)) / float(
+        mean_over_shape = float(weights @ relative_shape ** (speed_exponent + 1)) / float(
             weights @ relative_shape**2
         )
         damping_per_length = (
             HALF_AIR_DENSITY_KG_PER_M3
             * tip_speed_m_s ** (speed_exponent - 1)
-            * time_mean
-            * shape_mean
+            * mean_over_time
+            * mean_over_shape
         )
         damping_ratios.append(damping_per_length / (2 * density_kg_per_m * omega_rad_s))
     return np.array(damping_ratios)

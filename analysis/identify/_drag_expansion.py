@@ -55,11 +55,11 @@ class DragExpansion:
         Drag law for which the drag torque was removed from the record.
     response : DragResponse
         Response of this beam to drag.
-    band : callable
+    band_spectrum : callable
         Function from torque samples, at the times of the angle, to their spectrum in the band.
     pole_derivatives : dict of int to ndarray of complex, shape (2, K)
         Derivatives by the real and the imaginary part of the upper pole of each mode.
-    external_derivatives : ndarray of complex, shape (2, 2, K)
+    external_damping_derivatives : ndarray of complex, shape (2, 2, K)
         Derivatives by the external damping that drives each of the two lowest modes, as in
         `DragTorque`.
     ln_density_derivative, delay_derivative : ndarray of complex, shape (K,)
@@ -73,16 +73,16 @@ class DragExpansion:
     plant: Plant
     law: DragLaw
     response: DragResponse
-    band: Callable[[RealArray], ComplexArray]
+    band_spectrum: Callable[[RealArray], ComplexArray]
     pole_derivatives: dict[int, ComplexArray]
-    external_derivatives: ComplexArray
+    external_damping_derivatives: ComplexArray
     ln_density_derivative: ComplexArray
     delay_derivative: ComplexArray
     law_derivatives: ComplexArray
     speed_m_s: float
     top_speed_m_s: float
 
-    def change_to(
+    def torque_change_to(
         self,
         plant: Plant,
         poles: Sequence[Pole],
@@ -105,7 +105,7 @@ class DragExpansion:
             _parameter_rows(parameter_slopes, parameter_names, BEAM_PARAMETERS).sum(axis=0)
         ]
         for external_derivative, damping_change in zip(
-            self.external_derivatives, self._external_damping_change(plant), strict=True
+            self.external_damping_derivatives, self._external_damping_terms(plant), strict=True
         ):
             derivative_spectra += list(external_derivative)
             parameter_steps += damping_change[:, 0].tolist()
@@ -120,10 +120,12 @@ class DragExpansion:
         real_spectra = np.array(derivative_spectra).view(np.float64)
         torque_change: ComplexArray = (np.array(parameter_steps) @ real_spectra).view(np.complex128)
         torque_jacobian: ComplexArray = (np.array(step_slopes).T @ real_spectra).view(np.complex128)
-        change_by_poles, jacobian_by_poles = self.change_by_poles(poles, parameter_slopes.shape[1])
+        change_by_poles, jacobian_by_poles = self.torque_change_by_poles(
+            poles, parameter_slopes.shape[1]
+        )
         return torque_change + change_by_poles, torque_jacobian + jacobian_by_poles
 
-    def change_by_poles(
+    def torque_change_by_poles(
         self, poles: Sequence[Pole], unknown_count: int
     ) -> tuple[ComplexArray, ComplexArray]:
         """Return the change of the drag torque due to the poles of another beam.
@@ -131,8 +133,8 @@ class DragExpansion:
         The spectrum of the change, shape (K,), is returned with its derivatives by the unknowns,
         shape (unknown_count, K). The poles are differentiated by the unknowns.
         """
-        change = np.zeros(self.delay_derivative.size, dtype=np.complex128)
-        jacobian = np.zeros((unknown_count, change.size), dtype=np.complex128)
+        torque_change = np.zeros(self.delay_derivative.size, dtype=np.complex128)
+        jacobian = np.zeros((unknown_count, torque_change.size), dtype=np.complex128)
         for pole in poles:
             if pole.mode not in self.pole_derivatives or not pole.oscillates:
                 continue
@@ -142,15 +144,15 @@ class DragExpansion:
                 pole.mode, own_pole, pole.at_rad_s
             )
             by_real, by_imaginary = self.pole_derivatives[pole.mode]
-            change += pole_step.real * by_real + pole_step.imag * by_imaginary - remainder
+            torque_change += pole_step.real * by_real + pole_step.imag * by_imaginary - remainder
             by_real_at_pole, by_imaginary_at_pole = (
                 self.pole_derivatives[pole.mode] - remainder_slopes
             )
             jacobian += np.outer(pole.derivative.real, by_real_at_pole)
             jacobian += np.outer(pole.derivative.imag, by_imaginary_at_pole)
-        return change, jacobian
+        return torque_change, jacobian
 
-    def _external_damping_change(self, plant: Plant) -> list[RealArray]:
+    def _external_damping_terms(self, plant: Plant) -> list[RealArray]:
         """Return the external damping of another beam minus that of this beam, for two modes.
 
         The difference is taken at the pole of each mode, without an expansion in the order:
@@ -194,16 +196,22 @@ class DragExpansion:
         other_term, other_conjugate_term = 1 / (s - other_pole), 1 / (s - other_pole.conjugate())
         term_ratio = other_term * other_conjugate_term / (own_term * own_conjugate_term)
         first_order_change = pole_step * own_term + pole_step.conjugate() * own_conjugate_term
-        by_real_part = term_ratio * (other_term + other_conjugate_term) - (
+        derivative_by_real_part = term_ratio * (other_term + other_conjugate_term) - (
             own_term + own_conjugate_term
         )
-        by_imaginary_part = 1j * (
+        derivative_by_imaginary_part = 1j * (
             term_ratio * (other_term - other_conjugate_term) - (own_term - own_conjugate_term)
         )
         remainder_transforms = torque_spectrum * np.array(
-            [term_ratio - 1 - first_order_change, by_real_part, by_imaginary_part]
+            [
+                term_ratio - 1 - first_order_change,
+                derivative_by_real_part,
+                derivative_by_imaginary_part,
+            ]
         )
-        remainder, *remainder_slopes = self.band(self.response.in_time(remainder_transforms))
+        remainder, *remainder_slopes = self.band_spectrum(
+            self.response.to_time_series(remainder_transforms)
+        )
         return remainder, np.array(remainder_slopes)
 
 

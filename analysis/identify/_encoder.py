@@ -17,10 +17,10 @@ from analysis.decimation import runs_of_true
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_MIN_CHANGES: Final = 4
+_MIN_ALTERNATING_CHANGES: Final = 4
 """Minimum number of alternating changes between two counts that show a motor at rest."""
 
-_MAX_COUNT_RATIO: Final = 1.5
+_MAX_SINGLE_COUNT_RATIO: Final = 1.5
 """Largest change of the reading that is a single count, relative to the smallest change of the
 record."""
 
@@ -37,18 +37,18 @@ def angle_without_alternating_counts(
         return angle_rad
     differences_rad = np.diff(angle_rad)
     change_indices = np.flatnonzero(differences_rad)
-    if change_indices.size < _MIN_CHANGES:
+    if change_indices.size < _MIN_ALTERNATING_CHANGES:
         return angle_rad
     changes_rad = differences_rad[change_indices]
-    reference_moves = np.cumsum(np.diff(reference_rad) != 0)[change_indices]
-    returns = (
+    reference_move_numbers = np.cumsum(np.diff(reference_rad) != 0)[change_indices]
+    is_alternating_change = (
         (changes_rad[1:] == -changes_rad[:-1])
-        & (np.abs(changes_rad[1:]) <= _MAX_COUNT_RATIO * np.abs(changes_rad).min())
-        & (reference_moves[1:] == reference_moves[:-1])
+        & (np.abs(changes_rad[1:]) <= _MAX_SINGLE_COUNT_RATIO * np.abs(changes_rad).min())
+        & (reference_move_numbers[1:] == reference_move_numbers[:-1])
     )
-    settled_rad = angle_rad.copy()
-    for first, last in zip(*runs_of_true(returns), strict=True):
-        if last - first + 1 >= _MIN_CHANGES:
+    corrected_angle_rad = angle_rad.copy()
+    for first, last in zip(*runs_of_true(is_alternating_change), strict=True):
+        if last - first + 1 >= _MIN_ALTERNATING_CHANGES:
             start, end = change_indices[[first, last]] + 1
-            settled_rad[start:end] = (angle_rad[start - 1] + angle_rad[start]) / 2
-    return settled_rad
+            corrected_angle_rad[start:end] = (angle_rad[start - 1] + angle_rad[start]) / 2
+    return corrected_angle_rad

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from analysis.identify.beam_uniformity import UniformBeamTest
     from rigd.beam import Damping, Plant
 
-_CONSTANT_TOLERANCES: Final = (0.03, 1e-3, 0.0)
+_MODAL_CONSTANT_TOLERANCES: Final = (0.03, 1e-3, 0.0)
 """Additional standard deviation of all modal constants in successive descents.
 
 Frequencies are known so precisely that a descent without tolerance would converge slowly along a
@@ -41,14 +41,14 @@ _GIVE_UP_CHI_SQUARE: Final = 6.0
 """Chi-square per degree of freedom above which a cause is given up after a descent with tolerance.
 """
 
-_DERIVATIVE_STEP: Final = 1e-6
+_NUMERICAL_DERIVATIVE_STEP: Final = 1e-6
 """Step of an unknown for numerical derivatives. Steps of the unknowns of a cause are relative to
 their range."""
 
 _MAX_DESCENT_STEPS: Final = 12
 """Maximum number of Gauss-Newton steps in the fit of a cause."""
 
-_MAX_RELATIVE_STEP: Final = 1.0
+_MAX_RELATIVE_UNKNOWN_STEP: Final = 1.0
 """Largest Gauss-Newton step of any unknown, relative to the scale of the unknown."""
 
 _MAX_CHI_SQUARE_RISE: Final = 10.0
@@ -65,13 +65,13 @@ _STEP_REGULARIZATION: Final = 1e-3
 """Regularization of Gauss-Newton steps: an unknown without effect keeps its value, and a determined
 unknown moves almost freely."""
 
-_NAMED_CHI_SQUARE_MARGIN: Final = 6.0
+_CHI_SQUARE_MARGIN_OF_NAMED_CAUSE: Final = 6.0
 """Excess of chi-square over the lowest of all causes, up to which a cause is named anyway.
 
 A general cause is considered only if its chi-square is lower than that of its special cases by more
 than this."""
 
-_NAMED_P_VALUE: Final = 0.05
+_MIN_P_VALUE_OF_NAMED_CAUSE: Final = 0.05
 """p-value above which a cause is named, however well another cause explains the modes."""
 
 _MAX_NAMED_CAUSES: Final = 5
@@ -126,76 +126,86 @@ def explanations(test: UniformBeamTest) -> tuple[CauseFit, ...]:
 
     The test has refused the plain uniform beam.
     """
-    problem, best_beam = test.problem, test.unknowns
+    problem, best_beam_unknowns = test.problem, test.unknowns
     if problem is None:
         return ()
     middle_start = problem.starts()[len(problem.starts()) // 2]
-    without_internal = np.where(np.arange(best_beam.size) == 0, problem.lower, middle_start)
-    explained_by: dict[str, CauseFit] = {}
+    start_without_internal_damping = np.where(
+        np.arange(best_beam_unknowns.size) == 0, problem.lower, middle_start
+    )
+    cause_fits_by_name: dict[str, CauseFit] = {}
     for cause in CAUSES:
-        start_beams = (
-            (best_beam, middle_start, without_internal)
+        beam_start_vectors = (
+            (best_beam_unknowns, middle_start, start_without_internal_damping)
             if cause.name == RELAXATION_CAUSE
-            else (best_beam, middle_start)
+            else (best_beam_unknowns, middle_start)
         )
-        cause_fit = _fit_cause(problem, cause, start_beams)
+        cause_fit = _fit_cause(problem, cause, beam_start_vectors)
         if cause_fit is None:
             continue
         # Of each name only the best fit, and no general cause if a special case suffices.
         rival_chi_squares = [
-            explained_by[cause_name].chi_square
+            cause_fits_by_name[cause_name].chi_square
             for cause_name in cause.special_case_names
-            if cause_name in explained_by
+            if cause_name in cause_fits_by_name
         ]
-        required_reduction = _NAMED_CHI_SQUARE_MARGIN
-        if cause.name in explained_by:
-            rival_chi_squares, required_reduction = [explained_by[cause.name].chi_square], 0.0
+        required_chi_square_reduction = _CHI_SQUARE_MARGIN_OF_NAMED_CAUSE
+        if cause.name in cause_fits_by_name:
+            rival_chi_squares, required_chi_square_reduction = (
+                [cause_fits_by_name[cause.name].chi_square],
+                0.0,
+            )
         if (
             not rival_chi_squares
-            or cause_fit.chi_square < min(rival_chi_squares) - required_reduction
+            or cause_fit.chi_square < min(rival_chi_squares) - required_chi_square_reduction
         ):
-            explained_by[cause.name] = cause_fit
+            cause_fits_by_name[cause.name] = cause_fit
     lowest_chi_square = min(
-        (cause_fit_found.chi_square for cause_fit_found in explained_by.values()), default=0.0
+        (cause_fit_found.chi_square for cause_fit_found in cause_fits_by_name.values()), default=0.0
     )
     named_causes = [
         cause_fit_found
-        for cause_fit_found in explained_by.values()
-        if cause_fit_found.p_value >= _NAMED_P_VALUE
-        or cause_fit_found.chi_square <= lowest_chi_square + _NAMED_CHI_SQUARE_MARGIN
+        for cause_fit_found in cause_fits_by_name.values()
+        if cause_fit_found.p_value >= _MIN_P_VALUE_OF_NAMED_CAUSE
+        or cause_fit_found.chi_square <= lowest_chi_square + _CHI_SQUARE_MARGIN_OF_NAMED_CAUSE
     ]
     named_causes.sort(key=lambda cause_fit_found: -cause_fit_found.p_value)
     return tuple(named_causes[:_MAX_NAMED_CAUSES])
 
 
 def _fit_cause(
-    problem: UniformBeamProblem, cause: Cause, start_beams: Sequence[NDArray[np.float64]]
+    problem: UniformBeamProblem, cause: Cause, beam_start_vectors: Sequence[NDArray[np.float64]]
 ) -> CauseFit | None:
     """Fit one cause to the modes; return None if it cannot be tested or does not explain them.
 
-    `start_beams` are unknowns of the beam from which the search starts. A cause at the limit of its
-    plausible range does not count as an explanation.
+    `beam_start_vectors` are unknowns of the beam from which the search starts. A cause at the limit
+    of its plausible range does not count as an explanation.
     """
-    beam_unknowns = problem.lower.size
-    degrees_of_freedom = problem.constant_count - beam_unknowns - len(cause.lower_bounds)
+    beam_unknown_count = problem.lower.size
+    degrees_of_freedom = problem.constant_count - beam_unknown_count - len(cause.lower_bounds)
     if degrees_of_freedom <= 0:
         return None
-    starts = [(*_CauseSearch(problem, cause, x).best_start(), x) for x in start_beams]
-    for _, start_unknowns, x in sorted(starts, key=lambda each: each[0]):
-        chi_square, y = _descend_with_tolerances(
-            problem, cause, x, start_unknowns, degrees_of_freedom
+    search_starts = [
+        (*_CauseSearch(problem, cause, beam_unknowns).best_start(), beam_unknowns)
+        for beam_unknowns in beam_start_vectors
+    ]
+    for _, start_unknowns, beam_unknowns in sorted(
+        search_starts, key=lambda search_start: search_start[0]
+    ):
+        chi_square, all_unknowns = _descend_with_tolerances(
+            problem, cause, beam_unknowns, start_unknowns, degrees_of_freedom
         )
         p_value = float(chi_square_p_value(chi_square, degrees_of_freedom))
         if p_value >= MIN_P_VALUE_OF_UNIFORM_BEAM:
             break
     else:
         return None
-    cause_unknowns = y[beam_unknowns:]
-    at_bound = (cause_unknowns <= cause.lower_bounds) | (cause_unknowns >= cause.upper_bounds)
-    at_bound[1:] &= cause_unknowns[1:] != 0  # a loss factor of 0 is allowed
-    if at_bound.any():
+    cause_unknowns = all_unknowns[beam_unknown_count:]
+    is_at_bound = (cause_unknowns <= cause.lower_bounds) | (cause_unknowns >= cause.upper_bounds)
+    is_at_bound[1:] &= cause_unknowns[1:] != 0  # a loss factor of 0 is allowed
+    if is_at_bound.any():
         return None
-    plant = problem.plant(y[:beam_unknowns])
+    plant = problem.plant(all_unknowns[:beam_unknown_count])
     cause_size, size_unit, phrase = cause.describe(cause_unknowns.tolist(), plant.beam)
     return CauseFit(
         name=cause.name,
@@ -212,44 +222,46 @@ def _fit_cause(
 def _descend_with_tolerances(
     problem: UniformBeamProblem,
     cause: Cause,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
+    beam_unknowns: NDArray[np.float64],
+    all_unknowns: NDArray[np.float64],
     degrees_of_freedom: int,
 ) -> tuple[float, NDArray[np.float64]]:
-    """Return chi-square and unknowns of beam and cause at a minimum reached from `y`.
+    """Return chi-square and unknowns of beam and cause at a minimum reached from `all_unknowns`.
 
     The first descents tolerate deviations of the modal constants; the last one does not.
     """
     chi_square = math.inf
-    for tolerance in _CONSTANT_TOLERANCES:
-        chi_square, y = _CauseSearch(problem, cause, x, tolerance).descend(y)
+    for tolerance in _MODAL_CONSTANT_TOLERANCES:
+        chi_square, all_unknowns = _CauseSearch(problem, cause, beam_unknowns, tolerance).descend(
+            all_unknowns
+        )
         if chi_square > _GIVE_UP_CHI_SQUARE * degrees_of_freedom:
             break
-    return chi_square, y
+    return chi_square, all_unknowns
 
 
 class _CauseSearch:
     """Search for the parameters of beam and cause, with one tolerance of the modal constants.
 
-    `x`, shape (7,), are the unknowns of the beam without the cause; an absent damping stays absent.
-    The tolerance is a standard deviation of every constant, in addition to the uncertainty of the
-    record.
+    `beam_unknowns`, shape (7,), are the unknowns of the beam without the cause; an absent damping
+    stays absent. The tolerance is a standard deviation of every constant, in addition to the
+    uncertainty of the record.
     """
 
     def __init__(
         self,
         problem: UniformBeamProblem,
         cause: Cause,
-        x: NDArray[np.float64],
-        tolerance: float = _CONSTANT_TOLERANCES[0],
+        beam_unknowns: NDArray[np.float64],
+        constant_tolerance: float = _MODAL_CONSTANT_TOLERANCES[0],
     ) -> None:
-        self._problem, self._cause, self._beam_x = problem, cause, x
+        self._problem, self._cause, self._beam_x = problem, cause, beam_unknowns
         self._lower = np.concatenate([problem.lower, cause.lower_bounds])
-        upper = np.where(x <= problem.lower, problem.lower, problem.upper)
-        self._upper = np.concatenate([upper, cause.upper_bounds])
+        upper_beam_bounds = np.where(beam_unknowns <= problem.lower, problem.lower, problem.upper)
+        self._upper = np.concatenate([upper_beam_bounds, cause.upper_bounds])
         cause_scale = np.max(np.abs([cause.lower_bounds, cause.upper_bounds]), axis=0)
-        self._scale = np.concatenate([np.ones(x.size), cause_scale])
-        covariance = problem.covariance + tolerance**2 * np.eye(problem.constant_count)
+        self._scale = np.concatenate([np.ones(beam_unknowns.size), cause_scale])
+        covariance = problem.covariance + constant_tolerance**2 * np.eye(problem.constant_count)
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def best_start(self) -> tuple[float, NDArray[np.float64]]:
@@ -257,40 +269,47 @@ class _CauseSearch:
 
         The unknowns of the beam have taken one step from each start before they are compared.
         """
-        x, derivatives = self._beam_x, None
-        lowest_step, highest_step = (limits[: x.size] - x for limits in (self._lower, self._upper))
+        beam_unknowns, derivatives = self._beam_x, None
+        lowest_step, highest_step = (
+            limits[: beam_unknowns.size] - beam_unknowns for limits in (self._lower, self._upper)
+        )
         stepped_starts = []
         for cause_start in self._cause.start_points:
-            y = np.concatenate([x, cause_start])
-            mode_terms = self._mode_terms(y)
-            residual, slopes = self._residual_and_slopes(x, mode_terms)
+            all_unknowns = np.concatenate([beam_unknowns, cause_start])
+            mode_terms = self._mode_terms(all_unknowns)
+            residual, slopes = self._residual_and_slopes(beam_unknowns, mode_terms)
             if derivatives is None:
                 derivatives = slopes()
             beam_step, _ = _limited_step(residual, derivatives, lowest_step, highest_step)
-            residual, _ = self._residual_and_slopes(x + beam_step, mode_terms)
+            residual, _ = self._residual_and_slopes(beam_unknowns + beam_step, mode_terms)
             stepped_starts.append(
-                (float(residual @ residual), np.concatenate([x + beam_step, cause_start]))
+                (
+                    float(residual @ residual),
+                    np.concatenate([beam_unknowns + beam_step, cause_start]),
+                )
             )
-        return min(stepped_starts, key=lambda pair: pair[0])
+        return min(stepped_starts, key=lambda chi_square_and_start: chi_square_and_start[0])
 
-    def descend(self, y: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Return the lowest chi-square on a Gauss-Newton path from `y`, and the unknowns there.
+    def descend(self, all_unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Return the lowest chi-square on a Gauss-Newton path, and the unknowns there.
 
         Steps are not shortened as a rule, even where chi-square rises a little: along a curved flat
         direction it rises first and then falls further.
         """
-        unknown_scale, lowest_chi_square, best_y = self._scale, math.inf, y
-        residual, beam_slopes = self._residual_at(y)
+        unknown_scale, lowest_chi_square, best_unknowns = self._scale, math.inf, all_unknowns
+        residual, beam_slopes = self._residual_at(all_unknowns)
         for _ in range(_MAX_DESCENT_STEPS):
             chi_square = float(residual @ residual)
             if chi_square < lowest_chi_square:
-                lowest_chi_square, best_y = chi_square, y
-            derivatives = np.concatenate([beam_slopes(), self._cause_slopes(y, residual)])
+                lowest_chi_square, best_unknowns = chi_square, all_unknowns
+            derivatives = np.concatenate(
+                [beam_slopes(), self._cause_slopes(all_unknowns, residual)]
+            )
             scaled_step, predicted_chi_square = _limited_step(
                 residual,
                 derivatives * unknown_scale[:, None],
-                (self._lower - y) / unknown_scale,
-                (self._upper - y) / unknown_scale,
+                (self._lower - all_unknowns) / unknown_scale,
+                (self._upper - all_unknowns) / unknown_scale,
             )
             if chi_square - predicted_chi_square < _CONVERGED_CHI_SQUARE_REDUCTION * max(
                 chi_square, 1.0
@@ -299,26 +318,31 @@ class _CauseSearch:
             scaled_step = (
                 scaled_step
                 * unknown_scale
-                * min(1.0, _MAX_RELATIVE_STEP / float(np.abs(scaled_step).max()))
+                * min(1.0, _MAX_RELATIVE_UNKNOWN_STEP / float(np.abs(scaled_step).max()))
             )
             for halving in range(_MAX_STEP_HALVINGS + 1):
-                next_y = np.clip(y + scaled_step / 2**halving, self._lower, self._upper)
-                residual, beam_slopes = self._residual_at(next_y)
+                next_unknowns = np.clip(
+                    all_unknowns + scaled_step / 2**halving, self._lower, self._upper
+                )
+                residual, beam_slopes = self._residual_at(next_unknowns)
                 if residual @ residual < _MAX_CHI_SQUARE_RISE * chi_square:
                     break
-            y = next_y
-        return lowest_chi_square, best_y
+            all_unknowns = next_unknowns
+        return lowest_chi_square, best_unknowns
 
-    def _mode_terms(self, y: NDArray[np.float64]) -> ModeTerms:
+    def _mode_terms(self, all_unknowns: NDArray[np.float64]) -> ModeTerms:
         """Return the Galerkin coefficients of the modes for the unknowns of beam and cause."""
-        x, cause_unknowns = y[: self._beam_x.size], y[self._beam_x.size :].tolist()
-        beam = self._problem.plant(x).beam
-        alteration = self._cause.add_deviation(
+        beam_unknowns, cause_unknowns = (
+            all_unknowns[: self._beam_x.size],
+            all_unknowns[self._beam_x.size :].tolist(),
+        )
+        beam = self._problem.plant(beam_unknowns).beam
+        deviations = self._cause.add_deviation(
             self._problem.stated_alteration, cause_unknowns, beam
         )
-        if alteration.has_same_mode_shapes(BeamDeviations()):
-            return replace(self._problem.plain_terms, deviations=alteration)
-        terms = galerkin_mode_terms(alteration, beam, self._problem.modes)
+        if deviations.has_same_mode_shapes(BeamDeviations()):
+            return replace(self._problem.plain_terms, deviations=deviations)
+        terms = galerkin_mode_terms(deviations, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
         return (
             terms
@@ -327,28 +351,30 @@ class _CauseSearch:
         )
 
     def _residual_and_slopes(
-        self, x: NDArray[np.float64], mode_terms: ModeTerms
+        self, beam_unknowns: NDArray[np.float64], mode_terms: ModeTerms
     ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
         """Return predicted minus measured modal constants, whitened, and a function for slopes.
 
-        `x` are the unknowns of the beam, shape (7,), and `mode_terms` describe the beam with the
-        cause. The slopes are the derivatives by `x` at constant mode shapes.
+        `beam_unknowns` are the unknowns of the beam, shape (7,), and `mode_terms` describe the beam
+        with the cause. The slopes are the derivatives by `beam_unknowns` at constant mode shapes.
         """
-        return self._problem.residual_and_slopes(x, self._whitener, mode_terms)
+        return self._problem.residual_and_slopes(beam_unknowns, self._whitener, mode_terms)
 
     def _residual_at(
-        self, y: NDArray[np.float64]
+        self, all_unknowns: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
-        """Return `_residual_and_slopes` for the unknowns `y` of beam and cause."""
-        return self._residual_and_slopes(y[: self._beam_x.size], self._mode_terms(y))
+        """Return `_residual_and_slopes` for the unknowns `all_unknowns` of beam and cause."""
+        return self._residual_and_slopes(
+            all_unknowns[: self._beam_x.size], self._mode_terms(all_unknowns)
+        )
 
     def _cause_slopes(
-        self, y: NDArray[np.float64], residual: NDArray[np.float64]
+        self, all_unknowns: NDArray[np.float64], residual: NDArray[np.float64]
     ) -> list[NDArray[np.float64]]:
-        """Return the derivatives of the `residual` at `y` by the unknowns of the cause."""
+        """Return the derivatives of the `residual` by the unknowns of the cause."""
         return [
-            (self._residual_at(y + cause_step)[0] - residual) / cause_step.sum()
-            for cause_step in _DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
+            (self._residual_at(all_unknowns + cause_step)[0] - residual) / cause_step.sum()
+            for cause_step in _NUMERICAL_DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
         ]
 
 
@@ -370,15 +396,15 @@ def _limited_step(
         design_matrix = np.concatenate(
             [derivative_rows[free_unknowns].T, _STEP_REGULARIZATION * np.eye(free_unknowns.size)]
         )
-        reduced_deviation = np.concatenate([-remaining_deviation, np.zeros(free_unknowns.size)])
-        unlimited, *_ = np.linalg.lstsq(design_matrix, reduced_deviation)
+        negative_deviation = np.concatenate([-remaining_deviation, np.zeros(free_unknowns.size)])
+        unlimited_step, *_ = np.linalg.lstsq(design_matrix, negative_deviation)
         step[free_unknowns] = np.clip(
-            unlimited, lowest_step[free_unknowns], highest_step[free_unknowns]
+            unlimited_step, lowest_step[free_unknowns], highest_step[free_unknowns]
         )
-        at_limit = step[free_unknowns] != unlimited
-        if not at_limit.any():
+        is_at_limit = step[free_unknowns] != unlimited_step
+        if not is_at_limit.any():
             break
-        free_unknowns = free_unknowns[~at_limit]
+        free_unknowns = free_unknowns[~is_at_limit]
     remaining_deviation = deviation + step @ derivative_rows
     return step, float(remaining_deviation @ remaining_deviation)
 

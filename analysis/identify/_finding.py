@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-Kind = Literal[
+FindingKind = Literal[
     "hum",
     "nonlinear stiffness",
     "nonlinear damping",
@@ -59,7 +59,7 @@ class Finding:
         flagged.
     """
 
-    kind: Kind
+    kind: FindingKind
     sentence: str
     value: float | None = None
     interval: tuple[float, float] | None = None
@@ -68,7 +68,7 @@ class Finding:
     parameters: tuple[str, ...] = ()
 
 
-MODEL_INDEPENDENT_KINDS: Final[frozenset[Kind]] = frozenset(
+MODEL_INDEPENDENT_KINDS: Final[frozenset[FindingKind]] = frozenset(
     {
         "hum",
         "sensor drift",

@@ -48,12 +48,12 @@ _ROUGH_COST_TOLERANCE: Final = 1e-4
 """Relative tolerance of the cost in a descent before noise and lines have been estimated: it moves
 the minimum by about a standard deviation."""
 
-_FAR_BEHIND_EVALUATIONS: Final = 20
+_HOPELESS_FIT_EVALUATIONS: Final = 20
 """Number of evaluations after which the descent of a structure ends if its cost is far above that
 of the closest structure. Such a descent converges slowly, along a flat direction that damping of
 the wrong kind causes."""
 
-_EARLY_EVALUATIONS: Final = 4
+_SHORT_DESCENT_EVALUATIONS: Final = 4
 """Number of evaluations after which the descent of a structure ends if its cost was, and still is,
 far above that of the closest structure."""
 
@@ -66,7 +66,7 @@ def fit_record(
     measurement: Measurement,
     structures: Iterable[Structure] = tuple(STRUCTURES.values()),
     *,
-    fixed: Iterable[Setting] = (),
+    fixed_settings: Iterable[Setting] = (),
     band_hz: tuple[float, float] = BAND_HZ,
 ) -> RecordAnalysis:
     """Fit damping structures to a whole record in a band.
@@ -85,7 +85,7 @@ def fit_record(
     structures : iterable of Structure
         Structures to fit. All use one noise spectrum, so that their costs are comparable: that of
         the structure closest to the coarse response.
-    fixed : iterable of str
+    fixed_settings : iterable of str
         Settings (`SETTINGS`) that stay at the values the file states.
     band_hz : tuple of float
         First and last frequency compared.
@@ -95,34 +95,36 @@ def fit_record(
     MeasurementError
         The record cannot be used.
     ValueError
-        `fixed` contains a name that is no setting.
+        `fixed_settings` contains a name that is no setting.
     """
-    fixed = tuple(fixed)
-    invalid_names = sorted(set(fixed) - set(SETTINGS))
+    fixed_settings = tuple(fixed_settings)
+    invalid_names = sorted(set(fixed_settings) - set(SETTINGS))
     if invalid_names:
         raise ValueError(f"{invalid_names} cannot be fixed: choose from {SETTINGS}.")
-    free_names = free_settings(fixed)
+    free_names = free_settings(fixed_settings)
     comparison = Comparison.from_measurement(measurement, band_hz)
-    nominal = measurement.nominal
+    nominal_plant = measurement.nominal_plant
     coarse_response = CoarseResponse(comparison)
     searches = [
         StructureSearch.start(Objective(comparison, unknowns), coarse_response)
         for unknowns in (
-            Unknowns.for_structure(structure, nominal, free_names) for structure in structures
+            Unknowns.for_structure(structure, nominal_plant, free_names) for structure in structures
         )
     ]
-    closest_index = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
+    closest_index = min(
+        range(len(searches)), key=lambda search_index: searches[search_index].minima[0].cost
+    )
     reference_descent = searches[closest_index].lowest_coarse_minimum()
     reference_descent = reference_descent.descend_to_minimum(
         reference_descent.noise(), _ROUGH_COST_TOLERANCE
     )
-    whole_angle = reference_descent.objective.comparison
-    comparison = whole_angle.use_reference_coherent_angle(reference_descent.plant)
+    whole_angle_comparison = reference_descent.objective.comparison
+    comparison = whole_angle_comparison.use_reference_coherent_angle(reference_descent.plant)
     searches = [search.with_comparison(comparison) for search in searches]
     reference_descent = Descent(searches[closest_index].objective, reference_descent.x)
-    remove_hum = reference_descent.remove_hum(_ROUGH_COST_TOLERANCE)
-    if remove_hum is not reference_descent:
-        reference_descent = _update_coherent_angle(remove_hum, whole_angle)
+    hum_free_descent = reference_descent.remove_hum(_ROUGH_COST_TOLERANCE)
+    if hum_free_descent is not reference_descent:
+        reference_descent = _update_coherent_angle(hum_free_descent, whole_angle_comparison)
         comparison = reference_descent.objective.comparison
         coarse_response = CoarseResponse(comparison)
         searches = [
@@ -141,14 +143,16 @@ def fit_record(
             comparison = reference_descent.objective.comparison
             searches = [search.with_comparison(comparison) for search in searches]
         noise, descents = _descend_with_noise(searches, closest_index, reference_descent, descents)
-        closest_index = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
+        closest_index = min(
+            range(len(searches)), key=lambda search_index: descents[search_index].cost(noise)
+        )
         reference_descent = descents[closest_index]
         if not _residual_is_noise(reference_descent, noise):
             break  # none of these explains it, so a further pass does not distinguish them better
         updated_descent = reference_descent.with_reestimated_angle(noise, _ROUGH_COST_TOLERANCE)
         if updated_descent is reference_descent:
             break
-    fits = (summary(descent.objective, descent.x, noise) for descent in descents)
+    fits = (record_fit_summary(descent.objective, descent.x, noise) for descent in descents)
     return RecordAnalysis.from_fits(fits, noise, comparison)
 
 
@@ -179,7 +183,7 @@ def refit_record(
         return None
     comparison = descent.objective.comparison
     return RecordAnalysis.from_fits(
-        [summary(descent.objective, descent.x, noise)], noise, comparison
+        [record_fit_summary(descent.objective, descent.x, noise)], noise, comparison
     )
 
 
@@ -207,10 +211,10 @@ def _descend_with_noise(
         .descend_to_lowest(noise_spectrum, reference_descent)
         .descend_to_minimum(noise_spectrum, _COST_TOLERANCE)
     )
-    far_behind_ratio = math.exp(
+    hopeless_cost_ratio = math.exp(
         HOPELESS_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.is_compared))
     )
-    cost_limit = far_behind_ratio * closest_descent.cost(noise_spectrum)
+    cost_limit = hopeless_cost_ratio * closest_descent.cost(noise_spectrum)
     structure_descents = []
     for i, search in enumerate(searches):
         descent = closest_descent if i == closest_index else None
@@ -220,7 +224,7 @@ def _descend_with_noise(
             )
         if descent is None:
             descent = search.descend_to_lowest(noise_spectrum).descend_to_minimum(
-                noise_spectrum, _COST_TOLERANCE, (_FAR_BEHIND_EVALUATIONS, cost_limit)
+                noise_spectrum, _COST_TOLERANCE, (_HOPELESS_FIT_EVALUATIONS, cost_limit)
             )
         structure_descents.append(descent)
     return noise_spectrum, structure_descents
@@ -228,10 +232,10 @@ def _descend_with_noise(
 
 def _residual_is_noise(descent: Descent, noise: NoiseSpectrum) -> bool:
     """Return whether the residual at the end of a descent is white at the 1 % level."""
-    objective, used_bins = descent.objective, noise.is_compared
+    objective, is_compared = descent.objective, noise.is_compared
     residual = objective.project(objective.linearise(descent.x), noise.weight).residual
-    hz = objective.comparison.frequency_hz
-    return whiteness(residual[used_bins], hz[used_bins]).is_nearly_white
+    frequency_hz = objective.comparison.frequency_hz
+    return whiteness(residual[is_compared], frequency_hz[is_compared]).is_nearly_white
 
 
 def _descent_if_still_worse(
@@ -241,19 +245,21 @@ def _descent_if_still_worse(
     if earlier_descent.cost(noise) <= cost_limit:
         return None
     short_descent = earlier_descent.descend_to_minimum(
-        noise, _COST_TOLERANCE, (_EARLY_EVALUATIONS, cost_limit)
+        noise, _COST_TOLERANCE, (_SHORT_DESCENT_EVALUATIONS, cost_limit)
     )
     return short_descent if short_descent.cost(noise) > cost_limit else None
 
 
-def _update_coherent_angle(descent: Descent, whole_angle: Comparison) -> Descent:
+def _update_coherent_angle(descent: Descent, whole_angle_comparison: Comparison) -> Descent:
     """Return a descent whose input, the angle that follows the reference, is estimated without hum.
 
     The first estimate was biased by the hum.
     """
     hum, unknowns = descent.objective.comparison.hum, descent.objective.unknowns
     for _ in range(_MAX_REFERENCE_ESTIMATES):
-        comparison = whole_angle.use_reference_coherent_angle(descent.plant).remove_hum(hum)
+        comparison = whole_angle_comparison.use_reference_coherent_angle(descent.plant).remove_hum(
+            hum
+        )
         descent = Descent(Objective(comparison, unknowns), descent.x)
         descent = descent.descend_to_minimum(descent.noise(), _COST_TOLERANCE)
         hum = descent.hum() or hum
@@ -263,37 +269,41 @@ def _update_coherent_angle(descent: Descent, whole_angle: Comparison) -> Descent
 # Result at a minimum
 
 
-def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) -> RecordFit:
+def record_fit_summary(
+    objective: Objective, vector_of_unknowns: NDArray[np.float64], noise: NoiseSpectrum
+) -> RecordFit:
     """Return the fit at a minimum of the cost: parameters, uncertainties, modes and residual.
 
-    `x`, shape (k,), are the unknowns at the minimum, which was found under the noise spectrum
-    `noise`.
+    `vector_of_unknowns`, shape (k,), are the unknowns at the minimum, which was found under the
+    noise spectrum `noise`.
     """
     unknowns, comparison = objective.unknowns, objective.comparison
-    linearisation = objective.linearise(x)
+    linearisation = objective.linearise(vector_of_unknowns)
     projected_residual = objective.project(linearisation, noise.weight)
     # Where the torque is unknown the residual is 0 and adds nothing to the cost.
-    compared_values = round(
+    compared_value_count = round(
         2 * np.sum(noise.is_compared) * comparison.measurement.known_torque_fraction
     )
-    degrees_of_freedom = compared_values - x.size - projected_residual.amplitudes.size
+    degrees_of_freedom = (
+        compared_value_count - vector_of_unknowns.size - projected_residual.amplitudes.size
+    )
     residual_variance = projected_residual.cost / degrees_of_freedom
     lower_bounds, upper_bounds = unknowns.bounds
-    at_bound = (x <= lower_bounds) | (x >= upper_bounds)
-    jacobian = _compared_jacobian(objective, x, projected_residual, noise)
-    covariance, determined_mask = covariance_of_unknowns(jacobian, residual_variance, at_bound)
-    unknown_names, plant = unknowns.names, unknowns.plant(x)
-    parameter_values = unknowns.parameters(x)
+    is_at_bound = (vector_of_unknowns <= lower_bounds) | (vector_of_unknowns >= upper_bounds)
+    jacobian = _compared_jacobian(objective, vector_of_unknowns, projected_residual, noise)
+    covariance, is_determined = covariance_of_unknowns(jacobian, residual_variance, is_at_bound)
+    unknown_names, plant = unknowns.names, unknowns.plant(vector_of_unknowns)
+    parameter_values = unknowns.parameters(vector_of_unknowns)
     parameter_uncertainties = parameter_uncertainty(
-        unknowns, x, at_bound, covariance, determined_mask
+        unknowns, vector_of_unknowns, is_at_bound, covariance, is_determined
     )
     std, intervals = dict(parameter_uncertainties.std), dict(parameter_uncertainties.interval)
     tool_inertia_name = "tool_inertia_kg_m2"
-    if tool_inertia_name in unknown_names and at_bound[unknown_names.index(tool_inertia_name)]:
+    if tool_inertia_name in unknown_names and is_at_bound[unknown_names.index(tool_inertia_name)]:
         inertia_index = unknown_names.index(tool_inertia_name)
-        other_at_bound = at_bound & (np.arange(at_bound.size) != inertia_index)
-        free_covariance, _ = covariance_of_unknowns(jacobian, residual_variance, other_at_bound)
-        estimates_by_unknowns = unknowns.estimates_by_unknowns(x)
+        is_other_at_bound = is_at_bound & (np.arange(is_at_bound.size) != inertia_index)
+        free_covariance, _ = covariance_of_unknowns(jacobian, residual_variance, is_other_at_bound)
+        estimates_by_unknowns = unknowns.estimates_by_unknowns(vector_of_unknowns)
         std[tool_inertia_name] = float(
             estimates_by_unknowns[inertia_index, inertia_index]
             * free_covariance[inertia_index, inertia_index] ** 0.5
@@ -304,7 +314,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
             parameter_values[tool_inertia_name], tool_inertia_std
         )
     hum_spectra = (
-        comparison.decays.hum([noise_line.frequency_hz for noise_line in noise.lines])
+        comparison.decay_spectra.hum([noise_line.frequency_hz for noise_line in noise.lines])
         * noise.weight
     )
     return RecordFit(
@@ -334,7 +344,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
 
 def _compared_jacobian(
     objective: Objective,
-    x: NDArray[np.float64],
+    vector_of_unknowns: NDArray[np.float64],
     projected_residual: ProjectedResidual,
     noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
@@ -345,7 +355,7 @@ def _compared_jacobian(
     comparison, unknowns = objective.comparison, objective.unknowns
     if comparison.measurement.torque_known.all():
         return projected_residual.jacobian
-    plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
+    plant, parameters_by_unknowns = unknowns.plant_and_gradient(vector_of_unknowns)
     unknown_gradient = comparison.gradient_at_unknown_torque(plant, unknowns.gradient_names)
     unknown_jacobian = noise.weight * (parameters_by_unknowns.T @ unknown_gradient)
     return projected_residual.jacobian - unknown_jacobian

@@ -40,14 +40,14 @@ _FREEST_STRUCTURE: Final = STRUCTURES["VI"]
 MAX_IMPACTS: Final = 3
 """Maximum number of impacts in one record."""
 
-_WINDOW_HALF_WIDTHS_S: Final = (0.08, 0.5)
+_IMPACT_WINDOW_HALF_WIDTHS_S: Final = (0.08, 0.5)
 """Half widths of the search windows about the sample that the scan finds: the first for a blow, the
 second for a touch."""
 
 _GAP_BEFORE_IMPACT_S: Final = 0.1
 """Duration in seconds between an impact and the samples before it that are tested for noise."""
 
-_COMPARED_DURATION_S: Final = 0.4
+_POWER_COMPARISON_DURATION_S: Final = 0.4
 """Duration in seconds, before and after an impact, over which the powers of the residual are
 compared."""
 
@@ -57,18 +57,18 @@ _MAX_POWER_BEFORE_OVER_AFTER: Final = 0.5
 _IMPACT_FIT_ROUNDS: Final = 2
 """Number of rounds that estimate poles and noise with the impact as part of the fit."""
 
-_EVIDENT_FRACTION: Final = 0.8
+_MIN_EVIDENT_COST_FRACTION: Final = 0.8
 """Minimum fraction of the unexplained cost that an evident impact explains."""
 
-_WORTHWHILE_FRACTION: Final = 0.5
+_MIN_WORTHWHILE_COST_FRACTION: Final = 0.5
 """Minimum fraction of the unexplained cost that an impact explains for a fit with the impact
 removed."""
 
-_OBVIOUS_FRACTION: Final = 0.95
+_MIN_OBVIOUS_COST_FRACTION: Final = 0.95
 """Minimum fraction of the unexplained cost for which an impact is accepted before any other effect
 is tested."""
 
-_MIN_DECAY_FRACTION: Final = 0.5
+_MIN_DECAY_COST_FRACTION: Final = 0.5
 """Minimum fraction of the cost reduction by an impact that is due to the free decays after the
 contact."""
 
@@ -77,10 +77,10 @@ _OVERWHELMING_COST_RATIO: Final = 10.0
 explain is attributed to the impact. Below this ratio it is attributed to the beam: the residual
 of a wrong model is at most 3 times the noise, and decays would explain all of that residual."""
 
-_QUIET_DURATION_S: Final = 2.0
+_QUIET_BEFORE_IMPACT_S: Final = 2.0
 """Duration in seconds before an impact in which the residual should be noise."""
 
-_MAX_QUIET_POWER_RATIO: Final = 1.5
+_MAX_POWER_BEFORE_IMPACT_RATIO: Final = 1.5
 """Largest power of the residual before an impact, relative to the noise."""
 
 
@@ -107,25 +107,27 @@ class DetectedImpact:
     def is_evident(self) -> bool:
         """Return whether the impact explains most of the torque residual and begins abruptly."""
         return (
-            self.explained_fraction > _EVIDENT_FRACTION
-            and self.residual_power_ratio < _MAX_QUIET_POWER_RATIO
+            self.explained_fraction > _MIN_EVIDENT_COST_FRACTION
+            and self.residual_power_ratio < _MAX_POWER_BEFORE_IMPACT_RATIO
         )
 
     @property
     def is_obvious(self) -> bool:
         """Return whether the impact explains so much that no other effect is tested first."""
         return (
-            self.explained_fraction > _OBVIOUS_FRACTION
-            and self.residual_power_ratio < _MAX_QUIET_POWER_RATIO
+            self.explained_fraction > _MIN_OBVIOUS_COST_FRACTION
+            and self.residual_power_ratio < _MAX_POWER_BEFORE_IMPACT_RATIO
         )
 
 
-def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
+def find_impacts(
+    candidate_set: CandidateSet, *, only_obvious: bool = False
+) -> Iterator[DetectedImpact]:
     """Search a record for one more impact on the beam; yield alternatives, the likeliest first.
 
     An impact may be larger than the response to the motor, so that a fit to the whole record fails.
     One half of the record then contains no impact, or only a free decay at its start. So the search
-    also uses the residual of fits to either half. With `obvious` it is limited to obvious
+    also uses the residual of fits to either half. With `only_obvious` it is limited to obvious
     impacts.
     """
     if (
@@ -133,18 +135,18 @@ def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Itera
         or len(candidate_set.comparison.measurement.impacts) == MAX_IMPACTS
     ):
         return
-    found_in_whole = find_impact(candidate_set)
-    if found_in_whole is not None and found_in_whole.is_obvious:
-        yield found_in_whole
-        found_in_whole = None
-    if obvious:
+    impact_in_whole_record = find_impact(candidate_set)
+    if impact_in_whole_record is not None and impact_in_whole_record.is_obvious:
+        yield impact_in_whole_record
+        impact_in_whole_record = None
+    if only_obvious:
         return
-    for refit_start in _fits_to_halves(candidate_set):
-        alternative_impact = _find_impact_in_residual(refit_start)
+    for start_refit in _refits_from_record_halves(candidate_set):
+        alternative_impact = _find_impact_in_residual(start_refit)
         if alternative_impact is not None:
             yield alternative_impact
-    if found_in_whole is not None:
-        yield found_in_whole
+    if impact_in_whole_record is not None:
+        yield impact_in_whole_record
 
 
 def find_impact(candidate_set: CandidateSet) -> DetectedImpact | None:
@@ -155,32 +157,32 @@ def find_impact(candidate_set: CandidateSet) -> DetectedImpact | None:
 
 def _find_impact_in_residual(refit: Refit) -> DetectedImpact | None:
     """Return an impact on the beam found in the residual of a refit, or None."""
-    start_sample = _likeliest_start(refit)
+    start_sample = _likeliest_impact_sample(refit)
     if start_sample is None:
         return None
     comparison = refit.objective.comparison
-    for window_half_width_s in _WINDOW_HALF_WIDTHS_S:
+    for window_half_width_s in _IMPACT_WINDOW_HALF_WIDTHS_S:
         half_width_samples = math.ceil(window_half_width_s * comparison.decimation.rate_hz)
         window_start, window_end = (
             max(start_sample - half_width_samples, 0),
-            min(start_sample + half_width_samples, comparison.samples),
+            min(start_sample + half_width_samples, comparison.sample_count),
         )
         refit_around_impact = _fit_around_impact(refit, window_start, window_end)
         impact_extent = _impact_extent(refit_around_impact, window_start, window_end)
         if impact_extent is None:
             return None
         found_impact = _impact_with_amplitudes(refit_around_impact, *impact_extent)
-        if found_impact.explained_fraction < _WORTHWHILE_FRACTION:
+        if found_impact.explained_fraction < _MIN_WORTHWHILE_COST_FRACTION:
             return None
         if impact_extent[0] > window_start:
             return found_impact
-        if found_impact.explained_fraction < _EVIDENT_FRACTION:
+        if found_impact.explained_fraction < _MIN_EVIDENT_COST_FRACTION:
             return None
         # A touch may have begun before this window: try the wider one.
     return None
 
 
-def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
+def _refits_from_record_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
     """Yield refits of the whole record that start from fits to either half of it.
 
     The damping structure is the freest one.
@@ -188,8 +190,11 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
     A half is skipped if its residual is not white.
     """
     comparison = candidate_set.comparison
-    measurement, hz = comparison.measurement, comparison.frequency_hz
-    band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
+    measurement, frequency_hz = comparison.measurement, comparison.frequency_hz
+    band_hz = (
+        0.0 if comparison.band_bins.start == 1 else float(frequency_hz[0]),
+        float(frequency_hz[-1]),
+    )
     middle_tick = measurement.angle_rad.size // 2
     for half_ticks in (slice(0, middle_tick), slice(middle_tick, None)):
         half_measurement = replace(
@@ -207,14 +212,14 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
             analysis = fit_record(half_measurement, (_FREEST_STRUCTURE,), band_hz=band_hz)
         except MeasurementError:
             continue
-        fit, used_bins = analysis.fits[0], analysis.noise.is_compared
+        fit, is_compared = analysis.fits[0], analysis.noise.is_compared
         if not whiteness(
-            fit.residual[used_bins], analysis.comparison.frequency_hz[used_bins]
+            fit.residual[is_compared], analysis.comparison.frequency_hz[is_compared]
         ).is_white:
             continue
         comparison_with_hum = comparison.remove_hum(()).recompute_incoherent_torque(fit.plant)
         unknowns = Unknowns.for_structure(
-            _FREEST_STRUCTURE, measurement.nominal, candidate_set.free_settings
+            _FREEST_STRUCTURE, measurement.nominal_plant, candidate_set.free_settings
         )
         refit_at_start = partial(
             Refit.descend,
@@ -225,7 +230,9 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         )
         first_refit = refit_at_start(noise=candidate_set.noise)
         noise_of_all_bins = replace(
-            first_refit.residual_noise(), is_compared=np.ones(hz.size, dtype=bool), lines=()
+            first_refit.residual_noise(),
+            is_compared=np.ones(frequency_hz.size, dtype=bool),
+            lines=(),
         )
         yield refit_at_start(noise=noise_of_all_bins)
 
@@ -235,10 +242,12 @@ def add_known_impact(measurement: Measurement, impact: DetectedImpact) -> Measur
     return replace(measurement, impacts=(*measurement.impacts, impact.impact))
 
 
-def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
+def impact_findings(
+    impacts: tuple[RecordedImpact, ...], *, is_explained: bool
+) -> Iterator[Finding]:
     """Yield a finding for each known impact of a record.
 
-    `explained` states whether the model with the impacts explains the record.
+    `is_explained` states whether the model with the impacts explains the record.
     """
     for impact in impacts:
         start_uncertainty_s = impact.start_uncertainty_s
@@ -246,11 +255,11 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
             kind="knock",
             sentence=(
                 f"The beam was struck at {impact.start_s:.2f} s (to within "
-                f"{start_uncertainty_s:.2g} s): {1e3 * impact.largest_nm:.3g} mN·m in the torque, "
-                "and from then on the free decay of its modes. "
+                f"{start_uncertainty_s:.2g} s): {1e3 * impact.largest_torque_nm:.3g} mN·m in the "
+                "torque, and from then on the free decay of its modes. "
                 + (
                     "It was fitted too, and biases nothing."
-                    if explained
+                    if is_explained
                     else "It was fitted too, but is not all that is in the record."
                 )
             ),
@@ -264,7 +273,7 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
 # Search
 
 
-def _likeliest_start(refit: Refit) -> int | None:
+def _likeliest_impact_sample(refit: Refit) -> int | None:
     """Return the index of the sample at which an impact most likely begins.
 
     Free decays of all modes from this sample on explain most of the residual. Return None if chance
@@ -276,28 +285,33 @@ def _likeliest_start(refit: Refit) -> int | None:
     if not poles:
         return None
     residual = refit.objective.project(refit.objective.linearise(refit.x), weight).residual
-    decays = comparison.decays.spectra(poles) * weight
-    projections = np.array([comparison.in_time(decay.conj() * residual) for decay in decays])
-    projections *= comparison.samples / 2
-    decay_lengths = np.sqrt(np.sum(np.abs(decays) ** 2, axis=1))
-    if not decay_lengths.all():
+    decay_spectra = comparison.decay_spectra.spectra(poles) * weight
+    projections = np.array(
+        [comparison.to_time_series(decay.conj() * residual) for decay in decay_spectra]
+    )
+    projections *= comparison.sample_count / 2
+    decay_norms = np.sqrt(np.sum(np.abs(decay_spectra) ** 2, axis=1))
+    if not decay_norms.all():
         return None
-    decay_gram = (decays.conj() @ decays.T).real / np.outer(decay_lengths, decay_lengths)
-    projections /= decay_lengths[:, None]
+    decay_gram = (decay_spectra.conj() @ decay_spectra.T).real / np.outer(decay_norms, decay_norms)
+    projections /= decay_norms[:, None]
     cost_reductions = np.sum(
-        projections * np.linalg.solve(decay_gram + 1e-9 * np.eye(decay_lengths.size), projections),
+        projections * np.linalg.solve(decay_gram + 1e-9 * np.eye(decay_norms.size), projections),
         axis=0,
     )
     start_sample = int(np.argmax(cost_reductions))
-    normal_deviate = chi_square_deviate(float(cost_reductions[start_sample]), decay_lengths.size)
-    if normal_deviate < math.sqrt(2 * largest_deviate_limit(comparison.samples)):
+    normal_deviate = chi_square_deviate(float(cost_reductions[start_sample]), decay_norms.size)
+    if normal_deviate < math.sqrt(2 * largest_deviate_limit(comparison.sample_count)):
         return None
     # The residual of a wrong model rises and falls with the sweep; an impact begins abruptly.
-    residual_power = comparison.in_time(residual) ** 2
+    residual_power = comparison.to_time_series(residual) ** 2
     rate_hz = comparison.decimation.rate_hz
     gap_samples, window_samples = (
         math.ceil(duration_s * rate_hz)
-        for duration_s in (_GAP_BEFORE_IMPACT_S, _GAP_BEFORE_IMPACT_S + _COMPARED_DURATION_S)
+        for duration_s in (
+            _GAP_BEFORE_IMPACT_S,
+            _GAP_BEFORE_IMPACT_S + _POWER_COMPARISON_DURATION_S,
+        )
     )
     power_before = residual_power[
         max(start_sample - window_samples, 0) : max(start_sample - gap_samples, 0)
@@ -374,12 +388,12 @@ def _successive_cost_reductions(
         np.ascontiguousarray(unexplained_spectra).view(np.float64).T
     )
     projections = orthonormal_basis.T @ residual.view(np.float64)
-    projections[np.abs(np.diag(triangular_factor)) < _DEPENDENT_LENGTH] = 0.0
+    projections[np.abs(np.diag(triangular_factor)) < _DEPENDENT_SPECTRUM_NORM] = 0.0
     cost_reductions: NDArray[np.float64] = projections**2
     return cost_reductions
 
 
-_DEPENDENT_LENGTH: Final = 1e-6
+_DEPENDENT_SPECTRUM_NORM: Final = 1e-6
 """Length of the part of a torque of length 1 that is orthogonal to the earlier torques, below which
 the torque is a linear combination of them."""
 
@@ -396,34 +410,42 @@ def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[in
     # Beginning: decays from the window's end on, then single samples backwards from there.
     impact = _impact_between(refit, window_end, window_end)
     decay_torques = _impact_torques(comparison, impact)
-    single_samples = np.zeros((window_end - window_start, comparison.samples))
-    single_samples[np.arange(window_end - window_start), np.arange(window_start, window_end)] = 1.0
+    single_sample_pulses = np.zeros((window_end - window_start, comparison.sample_count))
+    single_sample_pulses[
+        np.arange(window_end - window_start), np.arange(window_start, window_end)
+    ] = 1.0
     cost_reductions = _successive_cost_reductions(
-        refit, np.concatenate([decay_torques, single_samples[::-1]])
+        refit, np.concatenate([decay_torques, single_sample_pulses[::-1]])
     )[len(decay_torques) :]
-    net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - bic_penalty)])
-    first_sample = window_end - max(int(np.argmax(net_reduction)), 1)
+    net_cost_reductions = np.concatenate([[0.0], np.cumsum(cost_reductions - bic_penalty)])
+    first_sample = window_end - max(int(np.argmax(net_cost_reductions)), 1)
     # End: decays from the beginning on, then single samples forwards.
     impact = _impact_between(refit, first_sample, first_sample)
     decay_torques = _impact_torques(comparison, impact)
     cost_reductions = _successive_cost_reductions(
-        refit, np.concatenate([decay_torques, single_samples[first_sample - window_start :]])
+        refit, np.concatenate([decay_torques, single_sample_pulses[first_sample - window_start :]])
     )[len(decay_torques) :]
-    net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - bic_penalty)])
-    end_sample = first_sample + int(np.argmax(net_reduction))
-    reductions_samples_first = _successive_cost_reductions(
+    net_cost_reductions = np.concatenate([[0.0], np.cumsum(cost_reductions - bic_penalty)])
+    end_sample = first_sample + int(np.argmax(net_cost_reductions))
+    cost_reductions_samples_first = _successive_cost_reductions(
         refit,
         np.concatenate(
-            [single_samples[first_sample - window_start : end_sample - window_start], decay_torques]
+            [
+                single_sample_pulses[first_sample - window_start : end_sample - window_start],
+                decay_torques,
+            ]
         ),
     )
-    reduction_by_decays = float(reductions_samples_first[end_sample - first_sample :].sum())
-    normal_deviate = chi_square_deviate(reduction_by_decays, len(decay_torques))
-    is_significant = normal_deviate > math.sqrt(2 * largest_deviate_limit(comparison.samples))
+    cost_reduction_by_decays = float(
+        cost_reductions_samples_first[end_sample - first_sample :].sum()
+    )
+    normal_deviate = chi_square_deviate(cost_reduction_by_decays, len(decay_torques))
+    is_significant = normal_deviate > math.sqrt(2 * largest_deviate_limit(comparison.sample_count))
     return (
         (first_sample, end_sample)
         if is_significant
-        and reduction_by_decays > _MIN_DECAY_FRACTION * float(reductions_samples_first.sum())
+        and cost_reduction_by_decays
+        > _MIN_DECAY_COST_FRACTION * float(cost_reductions_samples_first.sum())
         else None
     )
 
@@ -434,40 +456,44 @@ def _impact_with_amplitudes(refit: Refit, first_sample: int, end_sample: int) ->
     impact = _impact_between(refit, first_sample, end_sample)
     unit_torques = _impact_torques(comparison, impact)
     cost_before, expected_cost = refit.cost, refit.expected_cost
-    is_beam_free = bool(cost_before < _OVERWHELMING_COST_RATIO * expected_cost)
+    are_beam_unknowns_free = bool(cost_before < _OVERWHELMING_COST_RATIO * expected_cost)
     unexplained_spectra, residual = refit.unexplained_spectra(
-        comparison.spectrum(unit_torques), beam_free=is_beam_free
+        comparison.spectrum(unit_torques), beam_free=are_beam_unknowns_free
     )
-    unexplained_parts = unexplained_spectra.view(np.float64)
-    spectrum_lengths = np.linalg.norm(unexplained_parts, axis=1)
-    spectrum_lengths[spectrum_lengths == 0] = 1.0
-    unexplained_parts /= spectrum_lengths[:, None]
-    amplitudes = -np.linalg.lstsq(unexplained_parts.T, residual.view(np.float64), rcond=1e-10)[0]
-    remaining_spectrum = (residual.view(np.float64) + amplitudes @ unexplained_parts).view(
+    real_unexplained_spectra = unexplained_spectra.view(np.float64)
+    spectrum_norms = np.linalg.norm(real_unexplained_spectra, axis=1)
+    spectrum_norms[spectrum_norms == 0] = 1.0
+    real_unexplained_spectra /= spectrum_norms[:, None]
+    amplitudes = -np.linalg.lstsq(
+        real_unexplained_spectra.T, residual.view(np.float64), rcond=1e-10
+    )[0]
+    remaining_residual = (residual.view(np.float64) + amplitudes @ real_unexplained_spectra).view(
         np.complex128
     )
-    remaining_cost = float(np.vdot(remaining_spectrum, remaining_spectrum).real)
-    amplitudes /= spectrum_lengths
+    remaining_cost = float(np.vdot(remaining_residual, remaining_residual).real)
+    amplitudes /= spectrum_norms
     torque_nm = amplitudes @ unit_torques
-    first_second_samples = slice(
+    samples_of_first_second = slice(
         first_sample, first_sample + math.ceil(comparison.decimation.rate_hz)
     )
-    remaining_in_time = comparison.in_time(remaining_spectrum)
-    before_impact = remaining_in_time[
+    remaining_residual_samples = comparison.to_time_series(remaining_residual)
+    residual_before_impact = remaining_residual_samples[
         max(
-            first_sample - math.ceil(_QUIET_DURATION_S * comparison.decimation.rate_hz), 0
+            first_sample - math.ceil(_QUIET_BEFORE_IMPACT_S * comparison.decimation.rate_hz), 0
         ) : first_sample
     ]
     return DetectedImpact(
         impact=replace(
             impact,
-            sizes=tuple(amplitudes.tolist()),
-            largest_nm=float(np.abs(torque_nm[first_second_samples]).max()),
+            component_amplitudes=tuple(amplitudes.tolist()),
+            largest_torque_nm=float(np.abs(torque_nm[samples_of_first_second]).max()),
         ),
         explained_fraction=float(
             (cost_before - remaining_cost) / max(cost_before - expected_cost, 1.0)
         ),
-        residual_power_ratio=float(np.mean(before_impact**2) / np.mean(remaining_in_time**2))
-        if before_impact.size
+        residual_power_ratio=float(
+            np.mean(residual_before_impact**2) / np.mean(remaining_residual_samples**2)
+        )
+        if residual_before_impact.size
         else 0.0,
     )

@@ -39,10 +39,12 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
     The disturbances are added to the lines of the noise. `fit` is the best fit under the estimated
     noise; its torque is subtracted.
     """
-    rate_hz, samples = comparison.decimation.rate_hz, comparison.samples
+    rate_hz, samples = comparison.decimation.rate_hz, comparison.sample_count
     end_hz = float(comparison.frequency_hz[-1])
-    predicted_nm, _ = comparison.prediction.torque(fit.plant)
-    residual_spectrum = np.fft.rfft(comparison.torque_nm[comparison.retained] - predicted_nm)
+    predicted_nm, _ = comparison.torque_predictor.torque(fit.plant)
+    residual_spectrum = np.fft.rfft(
+        comparison.torque_nm[comparison.retained_samples] - predicted_nm
+    )
     all_frequencies_hz = np.fft.rfftfreq(samples, 1 / rate_hz).astype(np.float64)
     is_near_end = np.abs(all_frequencies_hz - end_hz) < min(_SEARCH_RANGE_HZ, rate_hz / 2 - end_hz)
     known_fraction = comparison.measurement.known_torque_fraction
@@ -84,7 +86,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
 
 def repetition_period_s(comparison: Comparison) -> float:
     """Return the period in seconds of the motion of the motor; 0 if the motion does not repeat."""
-    motor_angle_rad = comparison.angle_rad[comparison.retained]
+    motor_angle_rad = comparison.angle_rad[comparison.retained_samples]
     motor_angle_rad = motor_angle_rad - motor_angle_rad.mean()
     sample_count = motor_angle_rad.size
     spectrum = np.fft.rfft(motor_angle_rad, 2 * sample_count)

@@ -491,7 +491,7 @@ class _ModalSearch:
         """Return the result of a test whether a residual depends linearly on the motor angle."""
         residual = whitened_residual.view(np.complex128)
         angle_spectrum = self.comparison.spectrum(
-            self.comparison.angle_rad[self.comparison.retained]
+            self.comparison.angle_rad[self.comparison.retained_samples]
         )
         used_bins = self.noise.is_compared
         first_used_bin = int(np.argmax(used_bins))
@@ -564,7 +564,7 @@ class _DerivativeSpan:
         if self._rows is not None:
             return self._rows
         search = self._search
-        rows: NDArray[np.float64] = search.comparison.shared_values.value_at(
+        rows: NDArray[np.float64] = search.comparison.shared_result_cache.value_at(
             search.x, lambda _x: search.span(), self
         )
         return rows

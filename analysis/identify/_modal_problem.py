@@ -151,16 +151,16 @@ class ModalProblem:
         numbers: tuple[int, ...],
     ) -> None:
         self._recent: RecentValues[_LinearSolution] = (
-            comparison.shared_values if comparison.is_long else RecentValues()
+            comparison.shared_result_cache if comparison.is_long else RecentValues()
         )
         self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
         self._effect_spectra = effect_spectra
-        self._s = comparison.prediction.s
+        self._s = comparison.torque_predictor.s
         self.scale_rad_s = 2 * math.pi * float(comparison.frequency_hz[-1])
         self._measured_torque = self._whiten(
-            comparison.spectrum(comparison.torque_nm[comparison.retained])
+            comparison.spectrum(comparison.torque_nm[comparison.retained_samples])
         )
         background_responses = np.array(
             [(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND_COEFFICIENTS)]
@@ -185,8 +185,8 @@ class ModalProblem:
         """Return the whitened torque spectra of transfer functions from the angle, (n, 2 K)."""
         comparison = self._comparison
         predicted_spectra = np.empty((len(responses), 2 * self._weight.size))
-        for rows in comparison.prediction.row_blocks(len(responses)):
-            torque_nm = comparison.prediction.in_time(np.asarray(responses[rows]))
+        for rows in comparison.torque_predictor.row_blocks(len(responses)):
+            torque_nm = comparison.torque_predictor.to_time_series(np.asarray(responses[rows]))
             predicted_spectra[rows] = self._whiten(comparison.spectrum(torque_nm))
         return predicted_spectra
 
@@ -293,7 +293,7 @@ class ModalProblem:
         triangular_factor = _orthonormalise(spectra)
         measured_torque = self._measured_torque
         if (drag := self._comparison.drag) is not None:
-            drag_change, _ = drag.change_by_poles(self._poles(x), x.size)
+            drag_change, _ = drag.torque_change_by_poles(self._poles(x), x.size)
             measured_torque = measured_torque - self._whiten(drag_change)
         projections = spectra @ measured_torque
         residual: NDArray[np.float64] = projections @ spectra - measured_torque
@@ -310,7 +310,7 @@ class ModalProblem:
         poles = self._poles(x)
         jacobian[:] = 0.0
         if (drag := self._comparison.drag) is not None:
-            jacobian[:] = self._whiten(drag.change_by_poles(poles, x.size)[1])
+            jacobian[:] = self._whiten(drag.torque_change_by_poles(poles, x.size)[1])
         if poles:
             nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
             decay_gradient = self._comparison.decay_gradient(poles, nuisance_amplitudes)
@@ -354,12 +354,12 @@ class ModalProblem:
         nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
         poles = self._poles(x)
         comparison = self._comparison
-        predicted_nm = comparison.prediction.torque(model)[0]
+        predicted_nm = comparison.torque_predictor.torque(model)[0]
         modal_residual = comparison.spectrum(
-            predicted_nm - comparison.torque_nm[comparison.retained]
+            predicted_nm - comparison.torque_nm[comparison.retained_samples]
         )
         if comparison.drag is not None:
-            modal_residual += comparison.drag.change_by_poles(poles, x.size)[0]
+            modal_residual += comparison.drag.torque_change_by_poles(poles, x.size)[0]
         return modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
 
     def ringing(

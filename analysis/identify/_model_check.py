@@ -154,7 +154,7 @@ class ModelCheck:
         )
         impacts = impact_findings(
             self.candidate_set.comparison.measurement.impacts,
-            explained=self.residual_tests.is_noise,
+            is_explained=self.residual_tests.is_noise,
         )
         if self.residual_tests.is_noise:
             return (*impacts, *marked_findings)

@@ -179,7 +179,7 @@ def fit_modes_with_drag(
         assumed_law = DragLaw(max(law.constant_m, _LEAST_DRAG_M))
         try:
             comparison = without_drag.remove_drag_torque(
-                fit_with_drag.uniform_plant(without_drag.measurement.nominal),
+                fit_with_drag.uniform_plant(without_drag.measurement.nominal_plant),
                 assumed_law,
                 fit_with_drag,
             )

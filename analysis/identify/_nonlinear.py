@@ -153,7 +153,7 @@ class NonlinearForceSpectra:
             * self._plant.channel_response(self._s)
         )
         torque_spectrum: NDArray[np.complex128] = self._comparison.spectrum(
-            self._transform.inverse(torque_transform, self._comparison.retained)
+            self._transform.inverse(torque_transform, self._comparison.retained_samples)
         )
         return torque_spectrum
 

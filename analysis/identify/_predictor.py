@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 
 @lru_cache(maxsize=16)
-def eigenvalues(count: int) -> NDArray[np.float64]:
+def eigenvalues(mode_count: int) -> NDArray[np.float64]:
     """Return the first eigenvalues k L of a clamped-free beam, shape (count,).
 
     They are the roots of ``1 + cos z cosh z = 0``.
 
     The array is cached and read-only.
     """
-    z = clamped_free_eigenvalues(count)
+    z = clamped_free_eigenvalues(mode_count)
     z.flags.writeable = False
     return z
 
@@ -56,15 +56,17 @@ class TorquePredictor:
         Angle from rest, band-limited: it has no power at half the rate.
     rate_hz : float
         Sampling rate of the angle.
-    retained : slice
+    retained_samples : slice
         Samples at which the torque is returned.
     """
 
     __slots__ = ("_response", "_retained", "_spectrum", "_transform", "rate_hz")
 
-    def __init__(self, angle_rad: NDArray[np.float64], rate_hz: float, retained: slice) -> None:
+    def __init__(
+        self, angle_rad: NDArray[np.float64], rate_hz: float, retained_samples: slice
+    ) -> None:
         self.rate_hz = rate_hz
-        self._retained = retained
+        self._retained = retained_samples
         self._transform = CausalTransform.for_record(angle_rad.size, rate_hz)
         self._response = ResponseGrid(self._transform.s)
         self._spectrum = self._transform.forward(angle_rad)
@@ -80,7 +82,7 @@ class TorquePredictor:
         """Return the grid of the Laplace variable for responses, in rad/s."""
         return self._response.s
 
-    def in_time(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def to_time_series(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return the torques in N·m that transfer functions predict from the angle, shape (..., m).
 
         Parameters
@@ -91,7 +93,7 @@ class TorquePredictor:
         return self._transform.inverse(responses * self._spectrum, self._retained)
 
     def torque(
-        self, plant: Plant | ModalModel, wrt: Sequence[str] = ()
+        self, plant: Plant | ModalModel, gradient_parameters: Sequence[str] = ()
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the predicted torque in N·m at the retained samples, and its derivatives.
 
@@ -99,7 +101,7 @@ class TorquePredictor:
         ----------
         plant : Plant or ModalModel
             Plant or model whose torque is computed.
-        wrt : sequence of str
+        gradient_parameters : sequence of str
             Names of k parameters as for `ResponseGrid.evaluate`; none for a modal model.
 
         Returns
@@ -107,12 +109,12 @@ class TorquePredictor:
         torque : ndarray, shape (m,)
         gradient : ndarray, shape (k, m)
         """
-        torque_spectra = self._torque_spectra(plant, wrt)
+        torque_spectra = self._torque_spectra(plant, gradient_parameters)
         torque_and_derivatives = self._transform.inverse(torque_spectra, self._retained)
         return torque_and_derivatives[0], torque_and_derivatives[1:]
 
     def torque_blocks(
-        self, plant: Plant | ModalModel, wrt: Sequence[str]
+        self, plant: Plant | ModalModel, gradient_parameters: Sequence[str]
     ) -> Iterator[tuple[slice, NDArray[np.float64]]]:
         """Yield the predicted torque in N·m at the retained samples and its derivatives, in blocks.
 
@@ -124,7 +126,7 @@ class TorquePredictor:
         plant, wrt
             As for `torque`.
         """
-        torque_spectra = self._torque_spectra(plant, wrt)
+        torque_spectra = self._torque_spectra(plant, gradient_parameters)
         for rows in self.row_blocks(len(torque_spectra)):
             yield rows, self._transform.inverse(torque_spectra[rows], self._retained)
 
@@ -141,21 +143,21 @@ class TorquePredictor:
             yield slice(first_row, min(first_row + block_rows, row_count))
 
     def _torque_spectra(
-        self, plant: Plant | ModalModel, wrt: Sequence[str]
+        self, plant: Plant | ModalModel, gradient_parameters: Sequence[str]
     ) -> NDArray[np.complex128]:
         """Return the transforms of the predicted torque and its k derivatives, shape (1 + k, n)."""
         if isinstance(plant, ModalModel):
             return (plant.response(self.s) * self._spectrum)[None]
         if isinstance(plant, StructurePlant):
-            return plant.torque_spectra(self.s, wrt, self._spectrum)
-        return self._response.evaluate(plant, wrt, self._spectrum)
+            return plant.torque_spectra(self.s, gradient_parameters, self._spectrum)
+        return self._response.evaluate(plant, gradient_parameters, self._spectrum)
 
     def torque_at_fine_samples(
         self,
         plant: Plant | ModalModel,
         rate_factor: int,
         fine_indices: NDArray[np.intp],
-        wrt: Sequence[str] = (),
+        gradient_parameters: Sequence[str] = (),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the torque in N·m at samples of a higher rate, and its derivatives.
 
@@ -167,7 +169,7 @@ class TorquePredictor:
             Higher rate, in multiples of `rate_hz`.
         fine_indices : ndarray of int, shape (p,)
             Samples at the higher rate, counted from the angle's first sample.
-        wrt : sequence of str
+        gradient_parameters : sequence of str
             Names of the k parameters with respect to which the torque is differentiated.
 
         Returns
@@ -175,7 +177,7 @@ class TorquePredictor:
         torque : ndarray, shape (p,)
         gradient : ndarray, shape (k, p)
         """
-        torque_spectra = self._torque_spectra(plant, wrt)
+        torque_spectra = self._torque_spectra(plant, gradient_parameters)
         torque_and_derivatives = self._transform.inverse_at(
             torque_spectra, fine_indices, rate_factor
         )

@@ -111,7 +111,7 @@ class Objective:
         self.unknowns = unknowns
         self.effect_spectra = no_spectra if effect_spectra is None else effect_spectra
         self._recent: RecentValues[Linearisation] = (
-            comparison.shared_values if comparison.is_long else RecentValues()
+            comparison.shared_result_cache if comparison.is_long else RecentValues()
         )
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
@@ -128,9 +128,9 @@ class Objective:
         gradient_names = unknowns.gradient_names
         plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
         spectra = np.empty((1 + len(gradient_names), comparison.frequency_hz.size), np.complex128)
-        for rows, torque_nm in comparison.prediction.torque_blocks(plant, gradient_names):
+        for rows, torque_nm in comparison.torque_predictor.torque_blocks(plant, gradient_names):
             if rows.start == 0:
-                torque_nm[0] -= comparison.torque_nm[comparison.retained]
+                torque_nm[0] -= comparison.torque_nm[comparison.retained_samples]
             spectra[rows] = comparison.spectrum(torque_nm)
         # A copy, so that the derivatives are not stored with the residual.
         residual, derivatives = spectra[0].copy(), spectra[1:]
@@ -142,7 +142,7 @@ class Objective:
         )
         jacobian = (parameters_by_unknowns.T @ _as_real_rows(derivatives)).view(np.complex128)
         if comparison.drag is not None:
-            drag_change, drag_derivatives = comparison.drag.change_to(
+            drag_change, drag_derivatives = comparison.drag.torque_change_to(
                 plant, poles, unknowns.names, parameters_by_unknowns
             )
             residual += drag_change

@@ -78,8 +78,10 @@ def test_residual(
     """
     comparison, compared_bins = candidate_set.comparison, candidate_set.noise.is_compared
     modal_residual = candidate_set.best.fit.residual if modal_fit is None else modal_fit.residual
-    angle_rad = comparison.angle_rad[comparison.retained]
-    unit_variance_residual = comparison.in_time(modal_residual) * math.sqrt(comparison.samples / 2)
+    angle_rad = comparison.angle_rad[comparison.retained_samples]
+    unit_variance_residual = comparison.to_time_series(modal_residual) * math.sqrt(
+        comparison.sample_count / 2
+    )
     harmonic_tests = harmonics(
         angle_rad, unit_variance_residual, comparison.decimation.rate_hz, band_hz
     )
@@ -322,7 +324,7 @@ def _explains_record(
 
 def _small_drag(candidate_set: CandidateSet, modal_fit: ModalFit) -> NDArray[np.complex128]:
     """Return the torque spectrum of a small drag on a beam with the fitted modes, shape (K,)."""
-    plant = modal_fit.uniform_plant(candidate_set.comparison.measurement.nominal)
+    plant = modal_fit.uniform_plant(candidate_set.comparison.measurement.nominal_plant)
     drag_spectra = small_drag_spectrum(candidate_set.comparison, plant, modal_fit)
     return np.asarray(drag_spectra[0])
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._candidate import Candidate
-from analysis.identify._fit import summary
+from analysis.identify._fit import record_fit_summary
 from analysis.identify._problem import Objective
 from analysis.identify.noise import NoiseSpectrum, smooth_power
 from analysis.identify.parametrization import VANISHING_LOSS, StepRule
@@ -225,10 +225,10 @@ class Refit:
 
     def fit(self) -> RecordFit:
         """Return the fit at this minimum with parameters, modes and uncertainties."""
-        fit = summary(self.objective, self.x, self.noise)
+        fit = record_fit_summary(self.objective, self.x, self.noise)
         if not len(self.effect_spectra):
             return fit
-        # `summary` does not know that the amplitudes of the effects are free as well.
+        # `record_fit_summary` does not know that the amplitudes of the effects are free as well.
         projected_objective = self.objective.project(
             self.objective.linearise(self.x), self.noise.weight
         )

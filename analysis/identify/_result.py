@@ -155,7 +155,9 @@ class RecordAnalysis:
             fits=tuple(fits),
             frequency_hz=comparison.frequency_hz,
             compared=noise.is_compared,
-            noise_nm2_per_hz=2 * noise.power / (comparison.samples * comparison.decimation.rate_hz),
+            noise_nm2_per_hz=2
+            * noise.power
+            / (comparison.sample_count * comparison.decimation.rate_hz),
             lines=noise.lines,
             comparison=comparison,
         )
@@ -163,7 +165,7 @@ class RecordAnalysis:
     @property
     def noise(self) -> NoiseSpectrum:
         """Return the noise spectrum of the torque under which the fits were made."""
-        density_factor = self.comparison.samples * self.comparison.decimation.rate_hz / 2
+        density_factor = self.comparison.sample_count * self.comparison.decimation.rate_hz / 2
         return NoiseSpectrum(self.noise_nm2_per_hz * density_factor, self.compared, self.lines)
 
     def fit_percent(self, fit: FitWithResidual) -> float:
@@ -179,7 +181,9 @@ class RecordAnalysis:
         """
         comparison, noise = self.comparison, self.noise
         torque_nm = (
-            comparison.torque_nm[comparison.retained] + comparison.removed_nm - comparison.hum_nm
+            comparison.torque_nm[comparison.retained_samples]
+            + comparison.removed_torque_nm
+            - comparison.hum_nm
         )
         measured_spectrum = comparison.spectrum(torque_nm)[noise.is_compared]
         unwhitened_residual = (fit.residual * np.sqrt(noise.power / 2))[noise.is_compared]

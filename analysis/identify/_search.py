@@ -100,7 +100,7 @@ class CoarseResponse:
         angle_spectrum = np.fft.rfft(comparison.angle_rad)[band_bins]
         torque_spectrum = np.fft.rfft(comparison.torque_nm)[band_bins]
         # Without excitation the motor moved with the noise: such bins show no response.
-        coherent_angle = np.fft.rfft(comparison.coherent_rad())[band_bins]
+        coherent_angle = np.fft.rfft(comparison.reference_coherent_angle_rad())[band_bins]
         angle_power = coherent_angle.real**2 + coherent_angle.imag**2
         is_excited = angle_power > 1e-12 * angle_power.max()
         measured_response, response_weights = (
@@ -326,9 +326,11 @@ class Descent:
         comparison = self.objective.comparison
         linearisation, noise = self.objective.linearise(self.x), self.noise()
         torque_amplitudes = self.objective.project(linearisation, noise.weight).amplitudes
-        decay_count = count_decay_spectra(linearisation.poles) * (1 + len(comparison.later_decays))
+        decay_count = count_decay_spectra(linearisation.poles) * (
+            1 + len(comparison.later_decay_spectra)
+        )
         decay_spectra = self.objective.unknown_torques(linearisation)[:decay_count]
-        decaying_nm = comparison.in_time(torque_amplitudes[:decay_count] @ decay_spectra)
+        decaying_nm = comparison.to_time_series(torque_amplitudes[:decay_count] @ decay_spectra)
         return find_hum_near_modes(comparison, self.plant, linearisation.poles, noise, decaying_nm)
 
     def remove_hum(self, tolerance: float) -> Descent:
@@ -361,7 +363,7 @@ class Descent:
         return estimate_noise(
             objective.project(linearisation, 1.0).residual,
             comparison.frequency_hz,
-            comparison.samples,
+            comparison.sample_count,
             comparison.measurement.known_torque_fraction,
             is_near_mode,
         )

@@ -222,7 +222,7 @@ def _assess_with_impacts(
         # Harmonics last through the whole sweep, but a strong impact may be mistaken for them.
         candidate_set = assessment.check.candidate_set
         for impact in find_impacts(
-            candidate_set, obvious="harmonics" in assessment.check.finding_kinds
+            candidate_set, only_obvious="harmonics" in assessment.check.finding_kinds
         ):
             impact_assessment = assess_measurement(
                 add_known_impact(candidate_set.comparison.measurement, impact)
@@ -255,7 +255,7 @@ def _select_with_known_impacts(
     )
     model = fit_linear_model(linear_candidates, band_hz)
     if not (model.explains_record or measurement.impacts):
-        for impact in find_impacts(linear_candidates, obvious=True):
+        for impact in find_impacts(linear_candidates, only_obvious=True):
             impact_assessment = _select_with_known_impacts(
                 add_known_impact(measurement, impact), fixed, band_hz, None
             )
@@ -374,7 +374,7 @@ def _uniform_beam_test(
     """Test whether a uniform beam predicts the measured modes; None if there is no modal model."""
     if modal_fit is None:
         return None
-    return uniform_beam_test(modal_fit, measurement.nominal, measurement.axis_tilt_deg)
+    return uniform_beam_test(modal_fit, measurement.nominal_plant, measurement.axis_tilt_deg)
 
 
 def _explain_deviations(
@@ -416,7 +416,7 @@ def _add_modal_model(
     if measurement.uniformity or beam_test.status == "refused" or measurement.axis_tilt_deg:
         estimate_with_tolerance = tolerant_estimate(
             check.modal_fit,
-            measurement.nominal,
+            measurement.nominal_plant,
             measurement.uniformity,
             measurement.axis_tilt_deg,
             is_uniform=beam_test.status != "refused",

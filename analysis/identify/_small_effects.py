@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._finding import Kind
+    from analysis.identify._finding import FindingKind
     from analysis.identify._modal_fit import ModalFit
     from rigd.beam import Plant
 
@@ -36,7 +36,7 @@ LARGE_DEVIANCE_REDUCTION: Final = 100.0
 """Reduction of deviance from which the first order may not suffice, so that the effect is searched
 for by its own model."""
 
-_EXACT_KINDS: Final[frozenset[Kind]] = frozenset({"nonlinear gain", "friction"})
+_EXACT_KINDS: Final[frozenset[FindingKind]] = frozenset({"nonlinear gain", "friction"})
 """Effects that do not change the motion of the beam, so that the first order is exact."""
 
 _FRICTION_SPEED_RAD_S: Final = 0.01
@@ -63,7 +63,7 @@ class SmallEffect:
         Reduction of deviance by the effect.
     """
 
-    kind: Kind
+    kind: FindingKind
     phrase: str
     torque_spectrum: NDArray[np.complex128]
     deviance_reduction: float
@@ -107,7 +107,7 @@ def small_effect(
     The effects are computed for the motion of `plant`, a beam close to the modal model.
     `drag_spectrum`, shape (K,), is that of a small air drag per metre of C_D d.
     """
-    possible_effects: list[tuple[Kind, str, NDArray[np.complex128]]] = [
+    possible_effects: list[tuple[FindingKind, str, NDArray[np.complex128]]] = [
         *_possible_effects(comparison, modal_fit, plant),
         ("air drag", "Air drag", drag_spectrum),
     ]
@@ -125,7 +125,7 @@ def small_effect(
 
 def _possible_effects(
     comparison: Comparison, modal_fit: ModalFit, plant: Plant
-) -> Iterator[tuple[Kind, str, NDArray[np.complex128]]]:
+) -> Iterator[tuple[FindingKind, str, NDArray[np.complex128]]]:
     """Yield kind, description and torque spectrum, (K,), of small effects other than air drag."""
     force_spectra = NonlinearForceSpectra(comparison, plant)
     for mode_number in modal_fit.visible:
@@ -145,7 +145,7 @@ def _possible_effects(
         backlash_spectrum(comparison, plant) / UNIT_BACKLASH_RAD,
     )
     yield "friction", "Dry friction between sensor and beam", _friction_spectrum(comparison)
-    model_torque_nm = comparison.prediction.torque(modal_fit.model)[0]
+    model_torque_nm = comparison.torque_predictor.torque(modal_fit.model)[0]
     largest_torque_nm = float(np.abs(model_torque_nm).max())
     if largest_torque_nm > 0 and math.isfinite(largest_torque_nm):
         for force_power, effect_words in ((3, "A gain of the torque that depends on its size"),
@@ -170,7 +170,8 @@ def _friction_spectrum(comparison: Comparison) -> NDArray[np.complex128]:
     )
     speed_rad_s = np.gradient(fine_angle_rad) * (_OVERSAMPLING * comparison.decimation.rate_hz)
     retained = slice(
-        _OVERSAMPLING * comparison.retained.start, _OVERSAMPLING * comparison.retained.stop
+        _OVERSAMPLING * comparison.retained_samples.start,
+        _OVERSAMPLING * comparison.retained_samples.stop,
     )
     friction_torque = (speed_rad_s / np.hypot(speed_rad_s, _FRICTION_SPEED_RAD_S))[retained]
     friction_spectrum: NDArray[np.complex128] = comparison.spectrum(friction_torque) / _OVERSAMPLING

@@ -81,7 +81,7 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
     step_torque = _StiffnessStepTorque(comparison, fit)
     best_step, sample_indices = (
         StiffnessStep(0.0, 0.0, 0.0),
-        np.linspace(0, comparison.samples, _COARSE_INSTANTS + 2)[1:-1],
+        np.linspace(0, comparison.sample_count, _COARSE_INSTANTS + 2)[1:-1],
     )
     instant_spacing = float(sample_indices[1] - sample_indices[0])
     for _ in range(2):
@@ -107,7 +107,7 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
             + instant_spacing * np.linspace(-1, 1, 2 * _FINE_INSTANTS_PER_SIDE + 3)[1:-1]
         )
         sample_indices = sample_indices[
-            (sample_indices > 0) & (sample_indices < comparison.samples)
+            (sample_indices > 0) & (sample_indices < comparison.sample_count)
         ]
     return best_step
 
@@ -146,7 +146,7 @@ class _StiffnessStepTorque:
 
         `sample_index` is the index of the sample at which the stiffness steps.
         """
-        retained_samples = self._comparison.retained
+        retained_samples = self._comparison.retained_samples
         later_vibrations = self._vibrations.copy()
         later_vibrations[:, : retained_samples.start + sample_index] = 0.0
         force_transforms = self._transform.forward(later_vibrations)

@@ -135,7 +135,7 @@ def fit_structure(
     noise = selection.analysis.noise
     comparison = selection.analysis.comparison
     undamped_unknowns = Unknowns.for_structure(
-        UNDAMPED, comparison.measurement.nominal, free_settings(fixed)
+        UNDAMPED, comparison.measurement.nominal_plant, free_settings(fixed)
     )
     unknowns = StructureUnknowns(
         structure,

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
-    from analysis.identify._finding import Kind
+    from analysis.identify._finding import FindingKind
     from rigd.beam import Plant
 
 
@@ -304,7 +304,7 @@ def _torque_slopes(comparison: Comparison, plant: Plant) -> dict[Effect, NDArray
 
     Each has the shape (samples,).
     """
-    _, (by_zeta, by_gamma, by_gain, by_density_over_stiffness) = comparison.prediction.torque(
+    _, (by_zeta, by_gamma, by_gain, by_density_over_stiffness) = comparison.torque_predictor.torque(
         plant, _GRADIENT_PARAMETERS
     )
     return {
@@ -328,11 +328,11 @@ def _torque_spectrum(
     """
     if changing_property == "play":
         return comparison.spectrum(
-            comparison.prediction.with_angle(backlash_angle).torque(plant)[0]
+            comparison.torque_predictor.with_angle(backlash_angle).torque(plant)[0]
         )
     if changing_property == "clock":
         return comparison.spectrum(_clock_torque(comparison, plant, change_size))
-    unit_ramp = np.linspace(-0.5, 0.5, comparison.samples)
+    unit_ramp = np.linspace(-0.5, 0.5, comparison.sample_count)
     torque_change = (
         unit_ramp * (torque_slopes or _torque_slopes(comparison, plant))[changing_property]
     )
@@ -348,7 +348,7 @@ def _clock_torque(comparison: Comparison, plant: Plant, change_size: float) -> N
     middle of the record. It is computed by its Taylor series, for the rate difference
     `change_size` in units of `_CLOCK_UNIT`.
     """
-    prediction, time_s = comparison.prediction, comparison.times_s()
+    prediction, time_s = comparison.torque_predictor, comparison.times_s()
     offset_s = _CLOCK_UNIT * (time_s - time_s.mean())
     response_grid = ResponseGrid(prediction.s)
     response_derivative = response_grid.evaluate(plant)[0]
@@ -356,7 +356,7 @@ def _clock_torque(comparison: Comparison, plant: Plant, change_size: float) -> N
     torque_change = np.zeros(offset_s.size)
     for term_number in range(1, _TAYLOR_TERMS + 1 if change_size else 2):
         response_derivative = response_derivative * response_grid.s
-        torque_change += taylor_factor * prediction.in_time(response_derivative)
+        torque_change += taylor_factor * prediction.to_time_series(response_derivative)
         taylor_factor = taylor_factor * change_size * offset_s / (term_number + 1)
     return torque_change
 
@@ -369,7 +369,7 @@ def backlash_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.comple
 def _backlash_angle(comparison: Comparison) -> NDArray[np.float64]:
     """Return the hub angle minus the shaft angle under backlash, in rad, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
-    shaft_angle_rad = comparison.measurement.angle_from_rest(highest_hz)
+    shaft_angle_rad = comparison.measurement.angle_from_rest_rad(highest_hz)
     hub_angle_rad = _hub_angle(shaft_angle_rad, UNIT_BACKLASH_RAD / 2)
     lag_rad: NDArray[np.float64] = comparison.decimation.apply(hub_angle_rad - shaft_angle_rad)
     return lag_rad
@@ -433,7 +433,7 @@ def memory_torque(
         n, comparison.decimation.rate_hz, _PADDING_RATIO, _DECAY_EXPONENT
     )
     s = transform.s
-    retained_samples = comparison.retained
+    retained_samples = comparison.retained_samples
     w = np.interp(
         np.arange(n), np.arange(retained_samples.start, retained_samples.stop), relative_change
     )
@@ -453,7 +453,7 @@ def memory_torque(
         """Return the transform of w times a quantity, from the transform of the quantity."""
         return transform.forward(w * in_time(laplace_transform))
 
-    k4_of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
+    k4_of_modes = (eigenvalues(comparison.visible_mode_count) / beam.length_m) ** 4
     modal_stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * k4_of_modes)
     for modal_stiffness, k in zip(modal_stiffnesses.tolist(), k4_of_modes.tolist(), strict=True):
         modal_compliance = 1 / ((1 + internal_damping) * k + inertial_term)
@@ -501,7 +501,7 @@ _EFFECT_NAMES: Final[dict[Effect, str]] = {
 }
 """Name of each effect, as the beginning of a sentence."""
 
-_FINDING_KINDS: Final[dict[Effect, Kind]] = {
+_FINDING_KINDS: Final[dict[Effect, FindingKind]] = {
     "damping": "drifting damping",
     "stiffness": "drifting stiffness",
     "gain": "drifting gain",

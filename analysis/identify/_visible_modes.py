@@ -51,8 +51,8 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
     of a beam that is not uniform are found as well. In a long record, weaker resonances are also
     found if `fit` has a much lower chi-square than the smooth response.
     """
-    torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained])
-    angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained])
+    torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained_samples])
+    angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained_samples])
     visible_numbers = []
     for mode_estimate in fit.modes:
         offset_hz = comparison.frequency_hz - mode_estimate.frequency_hz
@@ -86,7 +86,7 @@ def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: floa
     measurement = comparison.measurement
     reference_rad = measurement.reference_rad
     excitation_rad = (
-        measurement.angle_from_rest(1.0)
+        measurement.angle_from_rest_rad(1.0)
         if reference_rad is None
         else reference_rad - reference_rad[0]
     )

@@ -132,7 +132,7 @@ class DragTorque:
         Torque by drag in N·m.
     pole_derivatives : dict of int to ndarray, shape (2, m)
         Derivatives by the real and the imaginary part of the upper pole of each mode.
-    external_derivatives : ndarray, shape (2, 2, m)
+    external_damping_derivatives : ndarray, shape (2, 2, m)
         Derivatives by c_0 and c_1 of an external damping ``c_0 + c_1 s`` that drives each of the
         two lowest modes, with constant poles.
     law_derivatives : ndarray, shape (2, m)
@@ -148,7 +148,7 @@ class DragTorque:
     law: DragLaw
     torque_nm: RealArray
     pole_derivatives: dict[int, RealArray]
-    external_derivatives: RealArray
+    external_damping_derivatives: RealArray
     law_derivatives: RealArray
     delay_derivative: RealArray
     speed_m_s: float
@@ -292,7 +292,9 @@ class DragResponse:
                         self._oversampled_values(modal_speeds[mode_number - 1] * pole_factor),
                     )
                 )
-                direct_torques.append(self.in_time(modal_torques[mode_number - 1] * pole_factor))
+                direct_torques.append(
+                    self.to_time_series(modal_torques[mode_number - 1] * pole_factor)
+                )
         for mode_index in LOWEST_MODE_INDICES:
             inertia_term = self._inertia_terms[mode_index]
             for pole_factor in (1 / inertia_term, self.s / inertia_term):
@@ -304,7 +306,7 @@ class DragResponse:
                         ),
                     )
                 )
-                direct_torques.append(self.in_time(modal_torques[mode_index] * pole_factor))
+                direct_torques.append(self.to_time_series(modal_torques[mode_index] * pole_factor))
         force_changes = self._modal_force_changes(point_speed_m_s, law, speed_sources)
         torque_derivatives = [
             self._torque_over_time(force_change) for force_change in force_changes
@@ -320,16 +322,16 @@ class DragResponse:
         torque_transform = modal_torques.sum(axis=0) - force_spectra[-1]
         return DragTorque(
             law=law,
-            torque_nm=self.in_time(torque_transform),
+            torque_nm=self.to_time_series(torque_transform),
             pole_derivatives={
                 mode_number: np.array(torque_derivatives[2 * i : 2 * i + 2])
                 for i, mode_number in enumerate(mode_numbers)
             },
-            external_derivatives=np.reshape(
+            external_damping_derivatives=np.reshape(
                 external_derivatives, (len(LOWEST_MODE_INDICES), 2, self._samples)
             ),
             law_derivatives=np.array(law_derivatives),
-            delay_derivative=self.in_time(-self.s * torque_transform),
+            delay_derivative=self.to_time_series(-self.s * torque_transform),
             speed_m_s=self._mean_speed(point_speed_m_s),
             top_speed_m_s=top_speed_m_s,
         )
@@ -570,9 +572,11 @@ class DragResponse:
     def _torque_over_time(self, modal_forces: RealArray) -> RealArray:
         """Return the torque in N·m, shape (m,), that modal forces and root moment cause."""
         force_spectra = self._transform_forces(modal_forces)
-        return self.in_time(self._modal_torques(force_spectra).sum(axis=0) - force_spectra[-1])
+        return self.to_time_series(
+            self._modal_torques(force_spectra).sum(axis=0) - force_spectra[-1]
+        )
 
-    def in_time(self, torque_transform: ComplexArray) -> RealArray:
+    def to_time_series(self, torque_transform: ComplexArray) -> RealArray:
         """Convert the Laplace transform of a torque to samples in N·m, shape (..., m).
 
         The samples include delay and filters of the torque channel.

@@ -128,7 +128,7 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
     The modelled torque is computed from the measured angle. At higher frequencies the measured
     torque is noise, and the modelled torque is due to the encoder's quantisation.
     """
-    angle_rad = Measurement.from_record(record).angle_from_rest(highest_hz)
+    angle_rad = Measurement.from_record(record).angle_from_rest_rad(highest_hz)
     band_hz = (0.0, highest_hz)
     # Followed by its mirror image, the angle has no step at its end, to which the model would
     # respond before it in so narrow a band.

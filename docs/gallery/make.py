@@ -207,14 +207,14 @@ def find(fault: Fault) -> Finding:
         return np.sqrt(np.mean(values[:whole].reshape(-1, size) ** 2, axis=1))
 
     def residual(whitened: NDArray[np.complex128]) -> Residual:
-        in_time = comparison.in_time(whitened) * np.sqrt(comparison.samples / 2)
+        in_time = comparison.to_time_series(whitened) * np.sqrt(comparison.sample_count / 2)
         return Residual(
             np.array([np.sqrt(np.mean(np.abs(whitened[each]) ** 2) / 2) for each in bins]),
             over_time(in_time),
         )
 
     noise_nm = np.sqrt(np.mean(analysis.noise_nm2_per_hz) * analysis.frequency_hz[-1])
-    removed_nm = np.asarray(comparison.removed_nm)
+    removed_nm = np.asarray(comparison.removed_torque_nm)
     beam = residual(selection.fit.residual)
     modal = selection.headline.modal
     return Finding(
@@ -224,7 +224,7 @@ def find(fault: Fault) -> Finding:
         residual_hz=np.array([analysis.frequency_hz[each].mean() for each in bins]),
         modal=beam if modal is None else residual(modal.residual),
         beam=beam,
-        removed=over_time(np.broadcast_to(removed_nm / noise_nm, comparison.samples)),
+        removed=over_time(np.broadcast_to(removed_nm / noise_nm, comparison.sample_count)),
         time_s=np.arange(len(beam.over_time)) * size / rate_hz,
     )
 

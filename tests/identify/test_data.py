@@ -36,13 +36,13 @@ def test_record_is_read():
     assert measurement.delay_s == pytest.approx(3e-4)  # by how much the torque is older
     assert measurement.tool_inertia_kg_m2 == 1e-5
     assert measurement.uniformity == 2e-3
-    assert measurement.nominal.filter_time_constant_s == 2e-3
-    assert measurement.nominal.second_order_filter_time_constant_s == 0.0
+    assert measurement.nominal_plant.filter_time_constant_s == 2e-3
+    assert measurement.nominal_plant.second_order_filter_time_constant_s == 0.0
     assert measurement.reference_rad is RECORD.reference_rad
     assert measurement.angle_known.all()
     assert measurement.torque_known.all()
     assert measurement.known_torque_fraction == 1.0
-    assert measurement.angle_from_rest(50.0) == pytest.approx(RECORD.angle_rad - 0.1)
+    assert measurement.angle_from_rest_rad(50.0) == pytest.approx(RECORD.angle_rad - 0.1)
 
 
 COUNT_RAD = 7e-5
@@ -88,5 +88,5 @@ def test_masks_and_first_angle():
         SimpleNamespace(**vars(RECORD) | masks | {"rest_angle_rad": None})
     )
     assert measurement.known_torque_fraction == pytest.approx(0.9)
-    assert measurement.angle_from_rest(50.0)[0] == 0.0
-    assert measurement.angle_from_rest(50.0) == pytest.approx(RECORD.angle_rad - 0.1, abs=1e-4)
+    assert measurement.angle_from_rest_rad(50.0)[0] == 0.0
+    assert measurement.angle_from_rest_rad(50.0) == pytest.approx(RECORD.angle_rad - 0.1, abs=1e-4)

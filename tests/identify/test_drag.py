@@ -8,7 +8,7 @@ from wrong_models import RIGS, Drag, drags
 
 from analysis.identify import select
 from analysis.identify._drag import (
-    damping_ratio_by_drag_law,
+    damping_ratio_per_law_coefficient,
     damping_with_amplitude,
     refit_with_air_drag,
 )
@@ -124,10 +124,10 @@ def test_air_dissipates_as_equivalent_linear_damping(mode, number, power):
     shape = mode_shape(mode, x) / mode_shape(mode, 1.0)
     speed = omega * amplitude * np.outer(shape, np.sin(turn))
     taken = np.mean(HALF_AIR_DENSITY_KG_PER_M3 * np.abs(speed) ** (power + 1))
-    ratio = damping_ratio_by_drag_law(mode, omega, amplitude, density)[number]
+    ratio = damping_ratio_per_law_coefficient(mode, omega, amplitude, density)[number]
     linear = np.mean(2 * ratio * omega * density * speed**2)
     assert taken == pytest.approx(linear, rel=1e-3)
 
 
 def test_air_dissipates_nothing_at_rest():
-    assert damping_ratio_by_drag_law(1, 16.0, 0.0, 4.7e-3) == pytest.approx([0.0, 0.0])
+    assert damping_ratio_per_law_coefficient(1, 16.0, 0.0, 4.7e-3) == pytest.approx([0.0, 0.0])

@@ -56,11 +56,15 @@ def test_torque_agrees_with_time_stepping(brake, law):
     angle_rad = swept(8.0, 20.0)
     damping = Damping(zeta=5.4e-5, alpha=1.0, gamma=0.02, lambda_=1.0)
     comparison = compared(angle_rad)
-    found = response(comparison, Plant(LINK, damping)).torque(law).torque_nm[comparison.retained]
+    found = (
+        response(comparison, Plant(LINK, damping))
+        .torque(law)
+        .torque_nm[comparison.retained_samples]
+    )
     stepped = brake.drag_torque(
         angle_rad, RATE_HZ, LINK, damping, law.constant_m, law.decreasing_part
     )
-    truth = comparison.decimation.apply(stepped)[comparison.retained]
+    truth = comparison.decimation.apply(stepped)[comparison.retained_samples]
     assert np.abs(truth).max() > 0.02
     spectra = comparison.spectrum(found), comparison.spectrum(truth)
     assert deviation(*spectra) < 2e-3
@@ -71,8 +75,10 @@ def test_a_rod_in_air_halves_the_peaks_of_the_papers_chirp():
     """The rod of this stiffness and density, without other external damping."""
     comparison = compared(swept(120.0, 50.0, after_s=15.0))
     plant = Plant(LINK, Damping(zeta=5.4e-5, alpha=1.0, gamma=0.0, lambda_=1.0))
-    linear = comparison.prediction.torque(plant)[0]
-    braked = linear + response(comparison, plant).torque(WHITE).torque_nm[comparison.retained]
+    linear = comparison.torque_predictor.torque(plant)[0]
+    braked = (
+        linear + response(comparison, plant).torque(WHITE).torque_nm[comparison.retained_samples]
+    )
     assert np.abs(linear).max() == pytest.approx(0.331, rel=0.03)
     assert np.abs(braked).max() == pytest.approx(0.161, rel=0.03)
 
@@ -122,7 +128,7 @@ def test_derivatives_by_the_beam_go_through_its_poles(short, name, value, step, 
             np.array([distance_rad_s.real, distance_rad_s.imag]) @ here.pole_derivatives[one.mode]
         )
     if name == "gamma":
-        foreseen += 2 * step * here.external_derivatives[:, 1].sum(axis=0)
+        foreseen += 2 * step * here.external_damping_derivatives[:, 1].sum(axis=0)
     if name == "density":
         foreseen += 2 * step / value * here.ln_density_derivative
     if name == "delay_s":
@@ -145,17 +151,17 @@ def test_a_small_drag_is_the_first_order(short):
 )
 def test_removed_torque_returns_with_another_beam(short, here, there):
     """A fit's residual with another beam than that of the drag, against recomputed drag."""
-    torque_nm = short.prediction.torque(there)[0]
-    torque_nm = torque_nm + response(short, there).torque(LAW).torque_nm[short.retained]
+    torque_nm = short.torque_predictor.torque(there)[0]
+    torque_nm = torque_nm + response(short, there).torque(LAW).torque_nm[short.retained_samples]
     with_drag = short.remove_drag_torque(here, LAW)
     assert with_drag.drag is not None
     names = ("gamma",)
     poles = there.mode_poles(3, names)
-    change, _ = with_drag.drag.change_to(there, poles, names, np.eye(1))
-    linear = with_drag.spectrum(short.prediction.torque(there)[0])
-    taken = with_drag.spectrum((short.torque_nm - with_drag.torque_nm)[short.retained])
+    change, _ = with_drag.drag.torque_change_to(there, poles, names, np.eye(1))
+    linear = with_drag.spectrum(short.torque_predictor.torque(there)[0])
+    taken = with_drag.spectrum((short.torque_nm - with_drag.torque_nm)[short.retained_samples])
     truth = short.spectrum(torque_nm)
-    moved = np.linalg.norm(truth - taken - short.spectrum(short.prediction.torque(here)[0]))
+    moved = np.linalg.norm(truth - taken - short.spectrum(short.torque_predictor.torque(here)[0]))
     assert np.linalg.norm(linear + taken + change - truth) < 0.05 * moved
 
 
@@ -164,7 +170,9 @@ def test_filter_applies_to_drag_torque():
     plant = Plant(LINK, Damping(zeta=7.1e-5, alpha=1.0, gamma=5.5e-2, lambda_=1.0))
     law, constant_s = DragLaw(2.3e-3), 3e-3
     unfiltered, filtered = (
-        comparison.spectrum(response(comparison, each).torque(law).torque_nm[comparison.retained])
+        comparison.spectrum(
+            response(comparison, each).torque(law).torque_nm[comparison.retained_samples]
+        )
         for each in (plant, replace(plant, filter_time_constant_s=constant_s))
     )
     divisor = 1 + 2j * np.pi * comparison.frequency_hz * constant_s
@@ -199,7 +207,7 @@ def test_the_torque_has_the_measured_phase_of_each_mode(short):
 
     def drag_spectrum(*plant_and_modes):
         drag = DragResponse(short.angle_rad, short.decimation.rate_hz, *plant_and_modes)
-        return short.spectrum(drag.first_order_torque()[short.retained])[near_mode_1]
+        return short.spectrum(drag.first_order_torque()[short.retained_samples])[near_mode_1]
 
     def lag_rad(residue):
         modes = SimpleNamespace(poles_rad_s=true_modes.poles_rad_s, residue=residue)

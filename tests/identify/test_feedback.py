@@ -124,7 +124,7 @@ def test_drift_does_not_reduce_the_coherent_part(controlled):
     comparison = Comparison.from_measurement(
         replace(measured, angle_rad=measured.angle_rad + drift), (0.0, 50.0)
     )
-    assert comparison.coherent_rad() is not comparison.angle_rad
+    assert comparison.reference_coherent_angle_rad() is not comparison.angle_rad
 
 
 @pytest.mark.fit
@@ -228,12 +228,12 @@ def test_coherent_part_is_reestimated_after_a_wrong_beam(controlled):
     other = first.with_reestimated_angle(
         replace(plant, beam=replace(LINK, density_kg_per_m=5.2e-3)), found.noise
     ).with_reestimated_angle(plant, found.noise)
-    assert other.angle_rad + other.incoherent_rad == pytest.approx(
-        first.angle_rad + first.incoherent_rad
+    assert other.angle_rad + other.incoherent_angle_rad == pytest.approx(
+        first.angle_rad + first.incoherent_angle_rad
     )
     for each in (first, other):
-        retained = each.torque_nm[each.retained] + each.incoherent_nm
-        assert retained == pytest.approx(comparison.torque_nm[comparison.retained])
+        retained = each.torque_nm[each.retained_samples] + each.incoherent_torque_nm
+        assert retained == pytest.approx(comparison.torque_nm[comparison.retained_samples])
     # Nothing was taken out there.
     assert comparison.with_reestimated_angle(plant, found.noise) is comparison
 
@@ -250,6 +250,6 @@ def test_narrow_band_ringing_is_followed_with_its_torque(in_narrow_bands):
     reestimated = wrong.with_reestimated_angle(plant, noise)
     assert loaded.tip_mass_kg == plant.tip_mass_kg
     first_std, reestimated_std = (
-        np.std(each.incoherent_rad[each.retained]) for each in (first, reestimated)
+        np.std(each.incoherent_angle_rad[each.retained_samples]) for each in (first, reestimated)
     )
     assert reestimated_std < 0.2 * first_std

@@ -85,7 +85,10 @@ def test_fitted_mode_beyond_the_band(sessions):
         sessions("VI").measured(noise_nm=NOISE_NM, seed=21), (0.0, 50.0)
     )
     pole = Pole(3, complex(-2.0, 2 * np.pi * 80), np.zeros(0))
-    plant, nothing = Plant(comparison.measurement.beam, Damping()), np.zeros(comparison.samples)
+    plant, nothing = (
+        Plant(comparison.measurement.beam, Damping()),
+        np.zeros(comparison.sample_count),
+    )
     noise = estimate_noise(
         comparison.spectrum(nothing) + 1.0, comparison.frequency_hz, nothing.size
     )

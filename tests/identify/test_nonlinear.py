@@ -19,7 +19,7 @@ def forces(sessions, plants, link):
 
 
 def spectrum(comparison, torque_nm):
-    return comparison.spectrum(comparison.decimation.apply(torque_nm)[comparison.retained])
+    return comparison.spectrum(comparison.decimation.apply(torque_nm)[comparison.retained_samples])
 
 
 def deviation(one, other):
@@ -57,9 +57,9 @@ def test_harmonics_of_a_force(link, plants, kind, multiples):
     column = NonlinearForceSpectra(comparison, Plant(link, plants["III"])).torque_spectrum(
         NonlinearTerm(kind, 1)
     )
-    samples = np.zeros(comparison.samples // 2 + 1, dtype=complex)
-    samples[comparison.bins] = column
-    late = np.fft.irfft(samples, comparison.samples)[-5000:]  # 40 s: 80 periods
+    samples = np.zeros(comparison.sample_count // 2 + 1, dtype=complex)
+    samples[comparison.band_bins] = column
+    late = np.fft.irfft(samples, comparison.sample_count)[-5000:]  # 40 s: 80 periods
     power = np.abs(np.fft.rfft(late * np.hanning(late.size))) ** 2
     at = {m: power[m * 80 - 2 : m * 80 + 3].sum() for m in (1, 2, 3)}
     made = {m for m, value in at.items() if value > 1e-4 * max(at.values())}

@@ -27,8 +27,8 @@ def link():
 def test_torque_agrees_with_independent_synthesis(sessions, link, plant, more):
     compared = Comparison.from_measurement(sessions("VI", **more).measured(), (0.0, 50.0))
     renamed = {name.replace("offsets", "stiffness_offsets"): value for name, value in more.items()}
-    torque, _ = compared.prediction.torque(Plant(link, plant.damping, **renamed))
-    measured = compared.torque_nm[compared.retained]
+    torque, _ = compared.torque_predictor.torque(Plant(link, plant.damping, **renamed))
+    measured = compared.torque_nm[compared.retained_samples]
     assert np.sqrt(np.mean((torque - measured) ** 2)) < 1e-6 * measured.std()
 
 

@@ -76,6 +76,6 @@ def test_subsamples_agree():
 
 def test_stated_filter_is_part_of_the_model(sessions):
     measurement = replace(sessions("III").measured(), filter_time_constant_s=1e-3)
-    assert measurement.nominal.filter_time_constant_s == 1e-3
-    unknowns = Unknowns.for_structure(STRUCTURES["III"], measurement.nominal, SETTINGS)
+    assert measurement.nominal_plant.filter_time_constant_s == 1e-3
+    unknowns = Unknowns.for_structure(STRUCTURES["III"], measurement.nominal_plant, SETTINGS)
     assert unknowns.plant(unknowns.start(np.log([1e-3, 1e-2]))).filter_time_constant_s == 1e-3

@@ -171,7 +171,7 @@ def test_fixed_parameters_do_not_compensate_a_scale(sessions):
     measurement = sessions("III").measured(noise_nm=1e-2, seed=1)
 
     def fixed(*names):
-        return fit_record(measurement, [STRUCTURES["III"]], fixed=names).fits[0]
+        return fit_record(measurement, [STRUCTURES["III"]], fixed_settings=names).fits[0]
 
     assert parameters_compensate_scales(fixed())
     assert parameters_compensate_scales(fixed("delay_s", "tool_inertia_kg_m2"))  # of no inertia

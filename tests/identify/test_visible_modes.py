@@ -26,7 +26,7 @@ def seen(sessions):
         measured = made.measured(noise_nm=noise_nm, seed=51)
         analysis = fit_record(measured, [STRUCTURES["III"]], band_hz=band_hz)
         comparison = analysis.comparison
-        scale = comparison.samples * comparison.decimation.rate_hz / 2
+        scale = comparison.sample_count * comparison.decimation.rate_hz / 2
         noise = NoiseSpectrum(analysis.noise_nm2_per_hz * scale, analysis.compared, analysis.lines)
         return visible_modes(comparison, noise, analysis.fits[0])
 

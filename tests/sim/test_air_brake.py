@@ -65,10 +65,10 @@ def unexplained(parameters, drag_m):
     plant = Plant(
         parameters.beam, parameters.damping, measured.delay_s, measured.tool_inertia_kg_m2
     )
-    linear = compared.prediction.torque(plant)[0]
+    linear = compared.torque_predictor.torque(plant)[0]
     response = DragResponse(compared.angle_rad, compared.decimation.rate_hz, plant)
-    drag = response.torque(DragLaw(drag_m)).torque_nm[compared.retained]
-    measured_nm = compared.torque_nm[compared.retained]
+    drag = response.torque(DragLaw(drag_m)).torque_nm[compared.retained_samples]
+    measured_nm = compared.torque_nm[compared.retained_samples]
     left, by_drag, whole = (
         float(np.linalg.norm(compared.spectrum(values)))
         for values in (linear + drag - measured_nm, drag, measured_nm)
