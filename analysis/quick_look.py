@@ -169,9 +169,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
                 record.metadata, record.angle_rad, record.rate_hz, headline.fit.plant
             )
             remark_sentences.append(
-                f"The record is long ({duration_s:.0f} s): type {headline.name} alone was fitted; "
-                "non-uniform beams, air drag, nonlinear forces and changes along the record were "
-                "not tried. analyze tries them."
+                f"The record is long ({duration_s:.0f} s): type {headline.name} alone was fitted; non-uniform beams, air drag, nonlinear forces and changes along the record were not tried. analyze tries them."
             )
     except MeasurementError as error:
         no_modes_sentence = f"No modes: {_remove_file_name(str(error), record.path)}"
@@ -199,7 +197,7 @@ def _model_document(
     from rigd.sweep_response import response_decimation
 
     if (
-        not headline.explained
+        not headline.is_explained
         or headline.drag_speed_m_s is not None
         or len(shown_frequencies_hz) == 0
     ):
@@ -380,8 +378,7 @@ def _stored_quick_look(session_path: Path) -> dict[str, Any]:
     quick_look = read_quick_look(quick_look_path(session_path))
     if quick_look is None:
         raise QuickLookError(
-            f"--last {session_path}: there is no readable quick look next to it; make one with "
-            f"python -m analysis.quick_look {session_path}."
+            f"--last {session_path}: there is no readable quick look next to it; make one with python -m analysis.quick_look {session_path}."
         )
     return quick_look
 
@@ -430,10 +427,7 @@ def _compare_modes(modes: list[ReportedMode], other_document: Mapping[str, Any])
                 "significant": any(are_significant),
             }
         )
-        change_texts = (
-            mode.frequency_change_text(other_mode),
-            f"damping {change_percent:+.2g} %",
-        )
+        change_texts = (mode.frequency_change_text(other_mode), f"damping {change_percent:+.2g} %")
         significant_texts = [
             change_text
             for change_text, is_different in zip(change_texts, are_significant, strict=True)
@@ -473,8 +467,7 @@ def _text_lines(quick_look_document: Mapping[str, Any]) -> Iterator[str]:
     )
     # The intervals do not include scale of the torque, length and density of the beam.
     yield (
-        f"Quick look at {quick_look_document['session_id']}{specimen_text}; ± 95 %, "
-        "statistical only:"
+        f"Quick look at {quick_look_document['session_id']}{specimen_text}; ± 95 %, statistical only:"
     )
     modes = modes_from_json(quick_look_document["modes"])
     shown_modes = [mode for mode in modes if mode.shown]

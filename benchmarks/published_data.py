@@ -187,7 +187,7 @@ def fit_record(
     found = fit_modes(comparison, white, starts)
     if found is None:
         raise ValueError("No mode shows in the band.")
-    modes = [found.mode(number) for number in found.visible]
+    modes = [found.mode(number) for number in found.visible_mode_numbers]
     return [Resonance(mode.frequency_hz, mode.damping_ratio) for mode in modes]
 
 

@@ -85,9 +85,12 @@ class PooledModalModel(ModalEstimate):
     def modes(self) -> tuple[PooledMode, ...]:
         """Frequency, damping ratio and inertia of each mode, with their standard deviations."""
         pooled_modes = []
-        for mode_number in self.numbers:
-            mode, (inertia, relative_std) = self.mode(mode_number), self.inertia(mode_number)
-            scatter_std = self.between_session_std[self.rows([mode_number])]
+        for mode_number in self.mode_numbers:
+            mode, (inertia, relative_std) = (
+                self.mode(mode_number),
+                self.effective_inertia(mode_number),
+            )
+            scatter_std = self.between_session_std[self.constant_indices([mode_number])]
             pooled_modes.append(
                 PooledMode(
                     number=mode_number,
@@ -118,7 +121,7 @@ def pooled_modal_model(sessions: Sequence[SessionAnalysis]) -> PooledModalModel 
     used_sessions = [
         session
         for session in modal_sessions
-        if session.modal and set(common_modes) <= set(session.modal.visible)
+        if session.modal and set(common_modes) <= set(session.modal.visible_mode_numbers)
     ]
     if not common_modes or len(used_sessions) < _MIN_POOLED_SESSIONS:
         return None
@@ -153,11 +156,13 @@ def pooled_modal_model(sessions: Sequence[SessionAnalysis]) -> PooledModalModel 
         )
     return PooledModalModel(
         model=modal_estimate.model,
-        numbers=common_modes,
-        constants=modal_estimate.constants,
+        mode_numbers=common_modes,
+        mode_constants=modal_estimate.mode_constants,
         joint_covariance=pooled_constants.covariance,
         sessions=len(used_sessions),
-        between_session_std=pooled_constants.between_session_std[: modal_estimate.constants.size],
+        between_session_std=pooled_constants.between_session_std[
+            : modal_estimate.mode_constants.size
+        ],
         stated_uniformities=stated_uniformities,
         uniform_beam=beam_test,
         tolerant=tolerant_fit,
@@ -182,7 +187,9 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
 
     Such a mode is visible in at least 90 % of the sessions, and in at least two.
     """
-    mode_counts = Counter(mode_number for estimate in estimates for mode_number in estimate.visible)
+    mode_counts = Counter(
+        mode_number for estimate in estimates for mode_number in estimate.visible_mode_numbers
+    )
     min_sessions = max(_MIN_COMMON_MODE_FRACTION * len(estimates), _MIN_POOLED_SESSIONS)
     return tuple(
         sorted(
@@ -217,12 +224,12 @@ def _constants_and_background(
     estimate: ModalEstimate, mode_numbers: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the modal constants and the background of a session in one vector, with covariance."""
-    constant_indices = estimate.rows(mode_numbers)
+    constant_indices = estimate.constant_indices(mode_numbers)
     joint_indices = np.concatenate(
-        [constant_indices, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
+        [constant_indices, np.arange(estimate.mode_constants.size, len(estimate.joint_covariance))]
     )
     constants_and_background = np.concatenate(
-        [estimate.constants[constant_indices], estimate.model.background]
+        [estimate.mode_constants[constant_indices], estimate.model.background]
     )
     return constants_and_background, estimate.joint_covariance[np.ix_(joint_indices, joint_indices)]
 
@@ -294,7 +301,10 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
     if not rising_estimates or not falling_estimates:
         return None
     common_modes = set.intersection(
-        *(set(estimate.visible) for estimate in (*rising_estimates, *falling_estimates))
+        *(
+            set(estimate.visible_mode_numbers)
+            for estimate in (*rising_estimates, *falling_estimates)
+        )
     )
     mode_numbers = tuple(sorted(common_modes))
     if not mode_numbers:

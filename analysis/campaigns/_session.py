@@ -279,7 +279,7 @@ def _session_result(
         sample_digests=sample_digests(record.angle_rad, record.torque_nm),
         validity=record_result.validity,
         modal=None
-        if modal_estimate is None or not modal_estimate.visible
+        if modal_estimate is None or not modal_estimate.visible_mode_numbers
         else modal_estimate.restrict_to_visible_modes(),
         nominal=None
         if whole_fits is None

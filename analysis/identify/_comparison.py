@@ -14,7 +14,7 @@ import numpy as np
 from analysis.decimation import Decimation, fast_fft_length_below
 from analysis.identify._data import MeasurementError
 from analysis.identify._drag_expansion import DragExpansion
-from analysis.identify._instrument import reference_coherent_part
+from analysis.identify._instrument import reference_coherent_angle
 from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragResponse
 from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, count_decay_spectra
@@ -343,7 +343,7 @@ class Comparison:
         recorded_samples = self._recorded_samples
         reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:recorded_samples]
         coherent_angle_rad = angle_rad.copy()
-        coherent_angle_rad[:recorded_samples] = reference_coherent_part(
+        coherent_angle_rad[:recorded_samples] = reference_coherent_angle(
             angle_rad[:recorded_samples], reference_rad, self.decimation.rate_hz, torque_nm
         )
         return coherent_angle_rad

@@ -333,7 +333,7 @@ def record_fit_summary(
             linearisation.poles,
             projected_residual,
             residual_variance,
-            objective.unknown_torques(linearisation) * noise.weight,
+            objective.unknown_torque_spectra(linearisation) * noise.weight,
             hum_spectra,
         ),
         cost=projected_residual.cost,

@@ -6,7 +6,7 @@ noise for response: in a closed loop noise and input are correlated, and a fit t
 beyond its band is biased by the noise [1]_: a chirp's tool inertia by 1.4 and its stiffness by 0.24
 standard deviations at 1e-2 N·m. The reference was known beforehand and does not depend on the
 noise, so the part of the angle that is coherent with the reference is used as input
-(`reference_coherent_part`). The torque caused by the remaining angle is computed with the current
+(`reference_coherent_angle`). The torque caused by the remaining angle is computed with the current
 estimate of the beam, and removed. The fit to the remaining torque is the instrumental-variable
 estimate with the reference as instrument. Where the remaining angle is noise, the estimate is
 unbiased for any beam. But a beam that rings for long moves the motor in bands narrower than the
@@ -32,7 +32,7 @@ from analysis.decimation import fast_fft_length
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_LAG_WINDOW_S: Final = 0.4
+_CORRELATION_LAG_WINDOW_S: Final = 0.4
 """Standard deviation in seconds of the window over the lags of the correlations: the time for which
 the loop may depend on its past reference (0.4 Hz in frequency).
 
@@ -48,7 +48,7 @@ _RELATIVE_POWER_FLOOR: Final = 1e-12
 """Minimum assumed power of the reference at a frequency, relative to its largest power."""
 
 
-def reference_coherent_part(
+def reference_coherent_angle(
     angle_rad: NDArray[np.float64],
     reference_rad: NDArray[np.float64],
     rate_hz: float,
@@ -62,21 +62,23 @@ def reference_coherent_part(
     Angle and reference are assumed to be 0 before the record. The torque on the motor without noise
     is a second input, since it may ring in bands narrower than the smoothing of the response.
     """
-    return_to_zero = 0.5 * (
+    return_to_zero_weights = 0.5 * (
         1 + np.cos(np.linspace(0, np.pi, round(_RETURN_TO_ZERO_S * rate_hz) + 1)[1:])
     )
-    padded_length = fast_fft_length(2 * (angle_rad.size + return_to_zero.size))
+    padded_length = fast_fft_length(2 * (angle_rad.size + return_to_zero_weights.size))
 
-    def spectrum_of(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        return np.fft.rfft(np.concatenate([values, values[-1] * return_to_zero]), padded_length)
+    def padded_spectrum(samples: NDArray[np.float64]) -> NDArray[np.complex128]:
+        return np.fft.rfft(
+            np.concatenate([samples, samples[-1] * return_to_zero_weights]), padded_length
+        )
 
     lag_s = np.fft.fftfreq(padded_length) * (padded_length / rate_hz)
-    lag_window = np.exp(-0.5 * (lag_s / _LAG_WINDOW_S) ** 2)
+    lag_window = np.exp(-0.5 * (lag_s / _CORRELATION_LAG_WINDOW_S) ** 2)
 
-    def smooth_over_frequency(power: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        return np.fft.rfft(lag_window * np.fft.irfft(power, padded_length))
+    def smooth_over_frequency(power_spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        return np.fft.rfft(lag_window * np.fft.irfft(power_spectrum, padded_length))
 
-    angle_spectrum, reference_spectrum = spectrum_of(angle_rad), spectrum_of(reference_rad)
+    angle_spectrum, reference_spectrum = padded_spectrum(angle_rad), padded_spectrum(reference_rad)
     cross_spectrum, reference_power = (
         smooth_over_frequency(angle_spectrum * reference_spectrum.conj()),
         smooth_over_frequency(np.abs(reference_spectrum) ** 2).real,
@@ -87,25 +89,25 @@ def reference_coherent_part(
     coherent_spectrum = cross_spectrum / reference_power * reference_spectrum
     if torque_nm is not None:
         # Use the part of the torque that is no smooth response to the reference.
-        torque_spectrum = spectrum_of(torque_nm)
-        torque_by_reference = (
+        torque_spectrum = padded_spectrum(torque_nm)
+        torque_per_reference = (
             smooth_over_frequency(torque_spectrum * reference_spectrum.conj()) / reference_power
         )
-        independent_torque_power = (
+        reference_free_torque_power = (
             smooth_over_frequency(np.abs(torque_spectrum) ** 2).real
-            - np.abs(torque_by_reference) ** 2 * reference_power
+            - np.abs(torque_per_reference) ** 2 * reference_power
         )
-        independent_torque_power = np.maximum(
-            independent_torque_power, _RELATIVE_POWER_FLOOR * independent_torque_power.max()
+        reference_free_torque_power = np.maximum(
+            reference_free_torque_power, _RELATIVE_POWER_FLOOR * reference_free_torque_power.max()
         )
-        response_to_torque = (
+        angle_per_torque = (
             smooth_over_frequency(angle_spectrum * torque_spectrum.conj())
-            - cross_spectrum * torque_by_reference.conj()
-        ) / independent_torque_power
-        coherent_spectrum += response_to_torque * (
-            torque_spectrum - torque_by_reference * reference_spectrum
+            - cross_spectrum * torque_per_reference.conj()
+        ) / reference_free_torque_power
+        coherent_spectrum += angle_per_torque * (
+            torque_spectrum - torque_per_reference * reference_spectrum
         )
-    coherent_rad: NDArray[np.float64] = np.fft.irfft(coherent_spectrum, padded_length)[
+    coherent_angle_rad: NDArray[np.float64] = np.fft.irfft(coherent_spectrum, padded_length)[
         : angle_rad.size
     ]
-    return coherent_rad
+    return coherent_angle_rad

@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
     from analysis.identify._result import RecordFit
 
-_SEARCH_RANGE_HZ: Final = 5.0
+_LINE_SEARCH_RANGE_HZ: Final = 5.0
 """Distance in hertz from the upper end of the band within which lines are searched for."""
 
-_SAME_LINE_HZ: Final = 0.1
+_SAME_LINE_DISTANCE_HZ: Final = 0.1
 """Distance in hertz within which two lines are considered the same line."""
 
-_DIFFERENT_MOTION_CORRELATION: Final = 0.5
+_MAX_DIFFERENT_MOTION_CORRELATION: Final = 0.5
 """Correlation of the motor angle with itself, at a time lag, below which the motions are different.
 """
 
-_REPEATED_MOTION_CORRELATION: Final = 0.9
+_MIN_REPEATED_MOTION_CORRELATION: Final = 0.9
 """Correlation of the motor angle with itself, at a time lag, above which the motion is repeated."""
 
-_HARMLESS_LEAKAGE_RATIO: Final = 0.3
+_MAX_HARMLESS_LEAKAGE_RATIO: Final = 0.3
 """Largest power that leaks into a bin without harm, relative to the noise."""
 
 
@@ -40,45 +40,47 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
     noise; its torque is subtracted.
     """
     rate_hz, samples = comparison.decimation.rate_hz, comparison.sample_count
-    end_hz = float(comparison.frequency_hz[-1])
+    band_end_hz = float(comparison.frequency_hz[-1])
     predicted_nm, _ = comparison.torque_predictor.torque(fit.plant)
     residual_spectrum = np.fft.rfft(
         comparison.torque_nm[comparison.retained_samples] - predicted_nm
     )
     all_frequencies_hz = np.fft.rfftfreq(samples, 1 / rate_hz).astype(np.float64)
-    is_near_end = np.abs(all_frequencies_hz - end_hz) < min(_SEARCH_RANGE_HZ, rate_hz / 2 - end_hz)
-    known_fraction = comparison.measurement.known_torque_fraction
-    near_mode = np.zeros(np.count_nonzero(is_near_end), dtype=bool)
-    noise_near_end = estimate_noise(
-        residual_spectrum[is_near_end],
-        all_frequencies_hz[is_near_end],
+    is_near_band_end = np.abs(all_frequencies_hz - band_end_hz) < min(
+        _LINE_SEARCH_RANGE_HZ, rate_hz / 2 - band_end_hz
+    )
+    known_torque_fraction = comparison.measurement.known_torque_fraction
+    is_near_mode = np.zeros(np.count_nonzero(is_near_band_end), dtype=bool)
+    noise_near_band_end = estimate_noise(
+        residual_spectrum[is_near_band_end],
+        all_frequencies_hz[is_near_band_end],
         samples,
-        known_fraction,
-        near_mode=near_mode,
+        known_torque_fraction,
+        is_near_mode=is_near_mode,
     )
     used_bins, noise_lines = noise.is_compared.copy(), list(noise.lines)
-    for leaking_line in noise_near_end.lines:
+    for leaking_line in noise_near_band_end.lines:
         # A line leaks as peak / (pi distance in bins).
-        spectrum_peak = leaking_line.amplitude_nm * samples / 2
-        harmless_peak = math.sqrt(_HARMLESS_LEAKAGE_RATIO * float(noise.power[-1]))
-        reach_hz = spectrum_peak / (math.pi * harmless_peak) * rate_hz / samples
-        used_bins &= np.abs(comparison.frequency_hz - leaking_line.frequency_hz) > reach_hz
+        line_peak = leaking_line.amplitude_nm * samples / 2
+        harmless_leakage = math.sqrt(_MAX_HARMLESS_LEAKAGE_RATIO * float(noise.power[-1]))
+        leakage_reach_hz = line_peak / (math.pi * harmless_leakage) * rate_hz / samples
+        used_bins &= np.abs(comparison.frequency_hz - leaking_line.frequency_hz) > leakage_reach_hz
         other_lines = [
             k
             for k in noise_lines
-            if abs(leaking_line.frequency_hz - k.frequency_hz) > _SAME_LINE_HZ
+            if abs(leaking_line.frequency_hz - k.frequency_hz) > _SAME_LINE_DISTANCE_HZ
         ]
         noise_lines = [*other_lines, leaking_line]
-    if not noise_near_end.lines:
+    if not noise_near_band_end.lines:
         return noise
     # The leakage has raised the estimated noise of whole blocks of bins: estimate it again.
-    clean_residual = (fit.residual * np.sqrt(noise.power / 2))[used_bins]
+    leakage_free_residual = (fit.residual * np.sqrt(noise.power / 2))[used_bins]
     bin_indices = np.arange(used_bins.size)
     noise_power = np.exp(
         np.interp(
             bin_indices,
             bin_indices[used_bins],
-            np.log(smooth_power(clean_residual) / known_fraction),
+            np.log(smooth_power(leakage_free_residual) / known_torque_fraction),
         )
     )
     return NoiseSpectrum(noise_power, used_bins, tuple(noise_lines))
@@ -99,15 +101,15 @@ def repetition_period_s(comparison: Comparison) -> float:
         * (cumulative_energy[sample_count] - cumulative_energy[lag_samples])
     )
     correlation = autocorrelation / np.maximum(overlap_norm, np.finfo(float).tiny)
-    different_lags = np.flatnonzero(correlation < _DIFFERENT_MOTION_CORRELATION)
-    if different_lags.size == 0:
+    different_motion_lags = np.flatnonzero(correlation < _MAX_DIFFERENT_MOTION_CORRELATION)
+    if different_motion_lags.size == 0:
         return 0.0
-    repeated_lags = np.flatnonzero(
-        (correlation > _REPEATED_MOTION_CORRELATION) & (lag_samples > different_lags[0])
+    repeated_motion_lags = np.flatnonzero(
+        (correlation > _MIN_REPEATED_MOTION_CORRELATION) & (lag_samples > different_motion_lags[0])
     )
-    if repeated_lags.size == 0:
+    if repeated_motion_lags.size == 0:
         return 0.0
-    period_samples = int(repeated_lags[0])
+    period_samples = int(repeated_motion_lags[0])
     while (
         period_samples + 1 < autocorrelation.size
         and correlation[period_samples + 1] > correlation[period_samples]

@@ -51,7 +51,7 @@ _MAX_LOSS_FACTOR: Final = 1.0
 _MAX_LOG_FREQUENCY_CHANGE: Final = 0.15
 """Largest change of the logarithm of a mode frequency in the search."""
 
-_LOWEST_RELATIVE_FREQUENCY: Final = 0.12
+_MIN_FREQUENCY_TO_FIRST_MODE: Final = 0.12
 """Lowest frequency compared, relative to that of the first mode. At lower frequencies the record
 contains sensor drift and 1/f noise, but nothing that determines a mode."""
 
@@ -67,16 +67,16 @@ _MODE_REACH_MARGIN_BINS: Final = 24
 """Number of frequency bins added to the distance from a mode within which the noise has no narrow
 peak."""
 
-_MAX_NOISE_ESTIMATES: Final = 3
+_MAX_NOISE_ESTIMATE_ROUNDS: Final = 3
 """Maximum number of estimates of the noise spectrum, each followed by a descent."""
 
-_NOISE_LOG_TOLERANCE: Final = 0.02
+_LOG_NOISE_TOLERANCE: Final = 0.02
 """Mean change of the logarithm of the noise power below which the noise spectrum has converged."""
 
 _MAX_ADDITIONAL_RESONANCES: Final = 2
 """Maximum number of resonances, of the sensor or the mount, that are added to those of the beam."""
 
-_MIN_DEVIANCE_REDUCTION: Final = 60.0
+_MIN_DEVIANCE_REDUCTION_BY_MODE: Final = 60.0
 """Minimum reduction of the deviance by a mode or an additional resonance that is retained."""
 
 _MIN_VISIBLE_DEVIANCE_REDUCTION: Final = 400.0
@@ -90,7 +90,7 @@ class ModalFit(ModalEstimate):
 
     Attributes
     ----------
-    evidence : tuple of float
+    cost_increases_without_mode : tuple of float
         Reduction of the deviance by each mode.
     residual : ndarray of complex, shape (K,)
         Whitened residual; its real and imaginary parts have variance 1 if only noise remains.
@@ -102,23 +102,23 @@ class ModalFit(ModalEstimate):
         Test of whether the residual depends linearly on the motor angle.
     ringing : Ringing
         Free decay at the beginning of the record.
-    derivatives : _DerivativeSpan
+    derivative_span : _DerivativeSpan
         Span of all derivatives of the whitened residual.
-    ln_damping_by_torque : ndarray, shape (n, 2 K)
+    ln_damping_per_torque : ndarray, shape (n, 2 K)
         Derivative of the logarithm of each estimated damping ratio by the whitened torque.
     effect_sizes, effect_stds : tuple of float
         Amplitude of each torque spectrum that was fitted with the modes, and its standard
         deviation.
     """
 
-    evidence: tuple[float, ...]
+    cost_increases_without_mode: tuple[float, ...]
     residual: NDArray[np.complex128]
     noise: NoiseSpectrum
     whiteness: Whiteness
     input_relation: InputRelation
     ringing: Ringing
-    derivatives: _DerivativeSpan
-    ln_damping_by_torque: NDArray[np.float64]
+    derivative_span: _DerivativeSpan
+    ln_damping_per_torque: NDArray[np.float64]
     effect_sizes: tuple[float, ...]
     effect_stds: tuple[float, ...]
 
@@ -136,22 +136,26 @@ class ModalFit(ModalEstimate):
             Torque spectra in N·m, not whitened.
         """
         torque_spectra = list(torque_spectra)
-        span, residual = self.derivatives.rows(), self.residual.view(np.float64)
+        span_rows, residual = self.derivative_span.span_rows(), self.residual.view(np.float64)
 
         def whitened_spectra(columns: slice) -> NDArray[np.float64]:
-            bins = slice(columns.start // 2, columns.stop // 2)
-            spectra = np.array([spectrum[bins] for spectrum in torque_spectra])
-            return np.ascontiguousarray(spectra * self.noise.weight[bins]).view(np.float64)
+            frequency_bins = slice(columns.start // 2, columns.stop // 2)
+            spectra = np.array([spectrum[frequency_bins] for spectrum in torque_spectra])
+            return np.ascontiguousarray(spectra * self.noise.weight[frequency_bins]).view(
+                np.float64
+            )
 
-        blocks = list(column_blocks(residual.size))
-        coefficients = sum(whitened_spectra(columns) @ span[:, columns].T for columns in blocks)
-        projections, squares = np.zeros((2, len(torque_spectra)))
-        for columns in blocks:
-            outside_span = whitened_spectra(columns) - coefficients @ span[:, columns]
+        column_ranges = list(column_blocks(residual.size))
+        span_coefficients = sum(
+            whitened_spectra(columns) @ span_rows[:, columns].T for columns in column_ranges
+        )
+        projections, squared_norms = np.zeros((2, len(torque_spectra)))
+        for columns in column_ranges:
+            outside_span = whitened_spectra(columns) - span_coefficients @ span_rows[:, columns]
             projections += outside_span @ residual[columns]
-            squares += np.einsum("ij,ij->i", outside_span, outside_span)
+            squared_norms += np.einsum("ij,ij->i", outside_span, outside_span)
         cost_reductions: NDArray[np.float64] = projections**2 / np.maximum(
-            squares, np.finfo(float).tiny
+            squared_norms, np.finfo(float).tiny
         )
         return cost_reductions
 
@@ -159,7 +163,7 @@ class ModalFit(ModalEstimate):
         """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
         return np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
 
-    def outside_span(self, whitened_spectra: NDArray[np.float64]) -> NDArray[np.float64]:
+    def part_outside_span(self, whitened_spectra: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the part of whitened spectra that no parameter of the fit can imitate.
 
         Parameters
@@ -167,9 +171,11 @@ class ModalFit(ModalEstimate):
         whitened_spectra : ndarray, shape (..., 2 K)
             Whitened spectra with real and imaginary parts interleaved.
         """
-        span = self.derivatives.rows()
-        outside_span: NDArray[np.float64] = whitened_spectra - (whitened_spectra @ span.T) @ span
-        return outside_span
+        span_rows = self.derivative_span.span_rows()
+        part_outside_span: NDArray[np.float64] = (
+            whitened_spectra - (whitened_spectra @ span_rows.T) @ span_rows
+        )
+        return part_outside_span
 
     def effect_std(self, torque_spectrum: NDArray[np.complex128]) -> float:
         """Return the standard deviation that the size of an additional effect would have.
@@ -179,11 +185,11 @@ class ModalFit(ModalEstimate):
         torque_spectrum : ndarray of complex, shape (K,)
             Torque spectrum of the effect in N·m per unit of its size, not whitened.
         """
-        remainder = self.outside_span(self._whiten(torque_spectrum))
-        return 1 / math.sqrt(max(float(remainder @ remainder), np.finfo(float).tiny))
+        unexplained_part = self.part_outside_span(self._whiten(torque_spectrum))
+        return 1 / math.sqrt(max(float(unexplained_part @ unexplained_part), np.finfo(float).tiny))
 
-    def damping_std_ratios(
-        self, torque_spectrum: NDArray[np.complex128], prior_std: float
+    def damping_std_growth_factors(
+        self, torque_spectrum: NDArray[np.complex128], prior_size_std: float
     ) -> NDArray[np.float64]:
         """Return how much less certain damping ratios are with an additional effect, shape (n,).
 
@@ -194,31 +200,33 @@ class ModalFit(ModalEstimate):
         ----------
         torque_spectrum : ndarray of complex, shape (K,)
             Torque spectrum of the effect in N·m per unit of its size, not whitened.
-        prior_std : float
+        prior_size_std : float
             Standard deviation of the size before the record.
         """
         whitened_spectrum = self._whiten(torque_spectrum)
-        size_variance = 1 / (self.effect_std(torque_spectrum) ** -2 + prior_std**-2)
+        size_variance = 1 / (self.effect_std(torque_spectrum) ** -2 + prior_size_std**-2)
         damping_variance = np.diag(self.covariance)[
             MODE_CONSTANT_NAMES.index("ln_damping_ratio") :: len(MODE_CONSTANT_NAMES)
         ]
-        added_variance = (self.ln_damping_by_torque @ whitened_spectrum) ** 2 * size_variance
-        std_ratios: NDArray[np.float64] = np.sqrt(1 + added_variance / damping_variance)
-        return std_ratios
+        added_damping_variance = (
+            self.ln_damping_per_torque @ whitened_spectrum
+        ) ** 2 * size_variance
+        growth_factors: NDArray[np.float64] = np.sqrt(1 + added_damping_variance / damping_variance)
+        return growth_factors
 
     @property
-    def explained(self) -> bool:
+    def residual_is_noise(self) -> bool:
         """Return whether only noise remains in the residual of the modal model."""
         return self.whiteness.is_white and not self.input_relation.related
 
     @property
-    def visible(self) -> tuple[int, ...]:
+    def visible_mode_numbers(self) -> tuple[int, ...]:
         """Return the sorted numbers of the beam modes that are visible in the record."""
-        modes_with_evidence = zip(self.numbers, self.evidence, strict=True)
+        modes_with_cost_increase = zip(self.numbers, self.cost_increases_without_mode, strict=True)
         return tuple(
             sorted(
                 mode_number
-                for mode_number, deviance_reduction in modes_with_evidence
+                for mode_number, deviance_reduction in modes_with_cost_increase
                 if mode_number and deviance_reduction > _MIN_VISIBLE_DEVIANCE_REDUCTION
             )
         )
@@ -235,18 +243,18 @@ class ModalFit(ModalEstimate):
         plant : Plant
             Plant with a bare beam.
         """
-        visible_modes = self.visible
+        visible_numbers = self.visible_mode_numbers
         if (
-            not visible_modes
+            not visible_numbers
             or any(plant.optional_parameters.values())
-            or len(visible_modes) != visible_modes[-1]
+            or len(visible_numbers) != visible_numbers[-1]
         ):
             return plant
-        frequency_hz = [
-            self.poles_rad_s[mode_number].imag / (2 * math.pi) for mode_number in visible_modes
+        mode_frequencies_hz = [
+            self.poles_rad_s[mode_number].imag / (2 * math.pi) for mode_number in visible_numbers
         ]
         try:
-            return plant.with_frequencies(frequency_hz)
+            return plant.with_frequencies(mode_frequencies_hz)
         except ValueError:
             return plant
 
@@ -254,30 +262,30 @@ class ModalFit(ModalEstimate):
 def fit_modes(
     comparison: Comparison,
     noise: NoiseSpectrum,
-    starts: Sequence[tuple[int, float, float]],
+    mode_starts: Sequence[tuple[int, float, float]],
     torque_spectra: NDArray[np.complex128] | None = None,
 ) -> ModalFit | None:
     """Return the modal model fitted to a record; None if no mode is in the band or significant.
 
-    `noise` is a first estimate; bins that it excludes stay excluded. `starts` are the mode number,
-    approximate frequency in Hz and approximate damping ratio of each mode. `torque_spectra`, shape
-    (c, K), are of known form and unknown amplitude, as for `Objective`.
+    `noise` is a first estimate; bins that it excludes stay excluded. `mode_starts` are the mode
+    number, approximate frequency in Hz and approximate damping ratio of each mode.
+    `torque_spectra`, shape (c, K), are of known form and unknown amplitude, as for `Objective`.
     """
-    search = _ModalSearch.starting_at(comparison, noise, starts, torque_spectra)
+    search = _ModalSearch.from_mode_starts(comparison, noise, mode_starts, torque_spectra)
     if search is None:
         return None
     search = search.remove_unexcited_modes().converge_with_noise().remove_undamped_modes()
     return search.add_resonances().fit()
 
 
-def modes_with_poles(
-    comparison: Comparison, noise: NoiseSpectrum, poles: Sequence[tuple[int, float, float]]
+def fit_with_given_poles(
+    comparison: Comparison, noise: NoiseSpectrum, mode_poles: Sequence[tuple[int, float, float]]
 ) -> ModalFit | None:
     """Return the modal model with given poles and the best residues, without a search.
 
     A pole is given by mode number, frequency in Hz and damping ratio.
     """
-    search = _ModalSearch.starting_at(comparison, noise, poles)
+    search = _ModalSearch.from_mode_starts(comparison, noise, mode_poles)
     return None if search is None else search.fit()
 
 
@@ -285,36 +293,37 @@ def modes_with_poles(
 class _ModalSearch:
     """Search for mode frequencies and damping under one noise estimate.
 
-    `x` is the current point ``(ln omega_1, eta_1, ln omega_2, …)``, with omega in rad/s.
+    `mode_unknowns` is the current point ``(ln omega_1, eta_1, ln omega_2, …)``, with omega in
+    rad/s.
     """
 
     comparison: Comparison
     noise: NoiseSpectrum
     effect_spectra: NDArray[np.complex128]
-    numbers: tuple[int, ...]
-    x: NDArray[np.float64]
+    mode_numbers: tuple[int, ...]
+    mode_unknowns: NDArray[np.float64]
 
     @classmethod
-    def starting_at(
+    def from_mode_starts(
         cls,
         comparison: Comparison,
         noise: NoiseSpectrum,
-        starts: Sequence[tuple[int, float, float]],
+        mode_starts: Sequence[tuple[int, float, float]],
         torque_spectra: NDArray[np.complex128] | None = None,
     ) -> _ModalSearch | None:
         """Return the search that starts at the modes in the band, or None if there is none."""
         starts_in_band = [
-            mode_start for mode_start in starts if mode_start[1] <= comparison.frequency_hz[-1]
+            mode_start for mode_start in mode_starts if mode_start[1] <= comparison.frequency_hz[-1]
         ]
         if not starts_in_band:
             return None
         effect_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
         effect_spectra = effect_spectra if torque_spectra is None else torque_spectra
-        lowest_hz = _LOWEST_RELATIVE_FREQUENCY * min(hz for _, hz, _ in starts_in_band)
-        used_bins = noise.is_compared & (comparison.frequency_hz >= lowest_hz)
+        lowest_hz = _MIN_FREQUENCY_TO_FIRST_MODE * min(hz for _, hz, _ in starts_in_band)
+        is_compared = noise.is_compared & (comparison.frequency_hz >= lowest_hz)
         return cls(
             comparison,
-            replace(noise, is_compared=used_bins),
+            replace(noise, is_compared=is_compared),
             effect_spectra,
             tuple(mode_number for mode_number, _, _ in starts_in_band),
             np.array(
@@ -327,7 +336,9 @@ class _ModalSearch:
 
     def problem(self) -> ModalProblem:
         """Return the least-squares problem of the modes of this search under its noise estimate."""
-        return ModalProblem(self.comparison, self.noise.weight, self.effect_spectra, self.numbers)
+        return ModalProblem(
+            self.comparison, self.noise.weight, self.effect_spectra, self.mode_numbers
+        )
 
     def descend_to_minimum(self) -> _ModalSearch:
         """Return the search moved to the minimum of the cost under its noise estimate."""
@@ -336,29 +347,37 @@ class _ModalSearch:
     def _descend(self, problem: ModalProblem) -> _ModalSearch:
         """Return the search moved to the minimum of the cost of its problem."""
         lower_bounds = np.column_stack(
-            [self.x[::2] - _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _MIN_LOSS_FACTOR)]
+            [
+                self.mode_unknowns[::2] - _MAX_LOG_FREQUENCY_CHANGE,
+                np.full(len(self.mode_numbers), _MIN_LOSS_FACTOR),
+            ]
         )
         upper_bounds = np.column_stack(
-            [self.x[::2] + _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _MAX_LOSS_FACTOR)]
+            [
+                self.mode_unknowns[::2] + _MAX_LOG_FREQUENCY_CHANGE,
+                np.full(len(self.mode_numbers), _MAX_LOSS_FACTOR),
+            ]
         )
         minimum = descend(
             problem.normal_equations,
-            self.x,
+            self.mode_unknowns,
             ConstantBounds(lower_bounds.ravel(), upper_bounds.ravel()),
             relative_tolerance=_COST_TOLERANCE,
             max_evaluations=60,
         )
-        return replace(self, x=minimum.x)
+        return replace(self, mode_unknowns=minimum.x)
 
     def converge_with_noise(self) -> _ModalSearch:
         """Alternate descents with estimates of noise and unknown torque until all converge."""
         search = self
-        for _ in range(_MAX_NOISE_ESTIMATES):
+        for _ in range(_MAX_NOISE_ESTIMATE_ROUNDS):
             problem = search.problem()
             search = search._descend(problem)
-            linear_parameters = problem.solution_at(search.x).linear_parameters
-            modal_model = problem.model(search.x, linear_parameters)
-            residual_spectrum = problem.residual(search.x, linear_parameters, modal_model)
+            linear_parameters = problem.solution_at(search.mode_unknowns).linear_parameters
+            modal_model = problem.modal_model(search.mode_unknowns, linear_parameters)
+            residual_spectrum = problem.residual_spectrum(
+                search.mode_unknowns, linear_parameters, modal_model
+            )
             comparison = search.comparison
             # A torque that the modal model lacks would change which part of the angle follows it.
             if not (len(search.effect_spectra) or comparison.drag):
@@ -372,20 +391,22 @@ class _ModalSearch:
                 ~search.is_near_mode(within_resonance=True),
             )
             noise_power /= comparison.measurement.known_torque_fraction
-            used_bins = search.noise.is_compared
-            mean_log_change = np.abs(np.log(noise_power / search.noise.power)[used_bins]).mean()
+            is_compared = search.noise.is_compared
+            mean_log_change = np.abs(np.log(noise_power / search.noise.power)[is_compared]).mean()
             search = replace(
                 search, comparison=comparison, noise=replace(search.noise, power=noise_power)
             )
-            if mean_log_change < _NOISE_LOG_TOLERANCE and comparison.measurement.torque_known.all():
+            if mean_log_change < _LOG_NOISE_TOLERANCE and comparison.measurement.torque_known.all():
                 break
         del problem  # which stores spectra, as the next one does
         return search.descend_to_minimum()
 
-    def span(self) -> NDArray[np.float64]:
+    def derivative_span_rows(self) -> NDArray[np.float64]:
         """Return orthonormal rows that span all derivatives of the residual, shape (r, 2 K)."""
         problem = self.problem()
-        return problem.uncertainty(self.x, problem.best_fit(self.x)[1]).span
+        return problem.uncertainty(
+            self.mode_unknowns, problem.residual_and_linear_parameters(self.mode_unknowns)[1]
+        ).span_rows
 
     def is_near_mode(self, *, within_resonance: bool = False) -> NDArray[np.bool_]:
         """Return a mask of the bins in which the residual may belong to a mode, shape (K,).
@@ -394,21 +415,23 @@ class _ModalSearch:
         `within_resonance`, within half of this distance. A peak of the noise begins outside of the
         whole distance, and ends at half of it.
         """
-        hz = self.comparison.frequency_hz[:, None]
-        mode_hz, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
-        margin_hz = _MODE_REACH_MARGIN_BINS * float(hz[1, 0] - hz[0, 0])
-        reach_hz = (
+        bin_hz = self.comparison.frequency_hz[:, None]
+        mode_hz, eta = np.exp(self.mode_unknowns[::2]) / (2 * np.pi), self.mode_unknowns[1::2]
+        margin_hz = _MODE_REACH_MARGIN_BINS * float(bin_hz[1, 0] - bin_hz[0, 0])
+        mode_reach_hz = (
             np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _MIN_RELATIVE_MODE_REACH) * mode_hz
             + margin_hz
         )
         if within_resonance:
-            reach_hz = reach_hz / 2
-        near_mode_mask: NDArray[np.bool_] = np.any(np.abs(hz - mode_hz) < reach_hz, axis=1)
-        return near_mode_mask
+            mode_reach_hz = mode_reach_hz / 2
+        is_near_any_mode: NDArray[np.bool_] = np.any(
+            np.abs(bin_hz - mode_hz) < mode_reach_hz, axis=1
+        )
+        return is_near_any_mode
 
     def cost(self) -> float:
         """Return the cost at the current point: the sum of the squared whitened residual."""
-        return self.problem().cost(self.x)
+        return self.problem().cost(self.mode_unknowns)
 
     def add_resonances(self) -> _ModalSearch:
         """Return the search with a resonance added where the residual depends on the motor angle.
@@ -418,29 +441,34 @@ class _ModalSearch:
         search = self
         for _ in range(_MAX_ADDITIONAL_RESONANCES):
             input_dependence = search.residual_dependence_on_angle(
-                search.problem().best_fit(search.x)[0]
+                search.problem().residual_and_linear_parameters(search.mode_unknowns)[0]
             )
             if not input_dependence.related:
                 break
             resonance_start = [math.log(2 * math.pi * input_dependence.at_hz), 0.02]
-            with_resonance = replace(
-                search, numbers=(*search.numbers, 0), x=np.concatenate([search.x, resonance_start])
+            search_with_resonance = replace(
+                search,
+                mode_numbers=(*search.mode_numbers, 0),
+                mode_unknowns=np.concatenate([search.mode_unknowns, resonance_start]),
             ).converge_with_noise()
-            without_resonance = replace(
-                search, noise=with_resonance.noise, comparison=with_resonance.comparison
+            search_without_resonance = replace(
+                search,
+                noise=search_with_resonance.noise,
+                comparison=search_with_resonance.comparison,
             ).descend_to_minimum()
             if (
-                without_resonance.cost() - with_resonance.cost() < _MIN_DEVIANCE_REDUCTION
-                or with_resonance.last_mode_overlaps()
+                search_without_resonance.cost() - search_with_resonance.cost()
+                < _MIN_DEVIANCE_REDUCTION_BY_MODE
+                or search_with_resonance.last_mode_overlaps()
             ):
                 break
-            search = with_resonance
+            search = search_with_resonance
         return search
 
     def last_mode_overlaps(self) -> bool:
         """Return whether the frequency of the last mode is within the width of another mode."""
-        mode_rad_s = np.exp(self.x[::2])
-        half_widths = mode_rad_s * self.x[1::2] / 2
+        mode_rad_s = np.exp(self.mode_unknowns[::2])
+        half_widths = mode_rad_s * self.mode_unknowns[1::2] / 2
         least_distances = _MODE_REACH_HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
         return bool(np.any(np.abs(mode_rad_s[:-1] - mode_rad_s[-1]) < least_distances))
 
@@ -450,11 +478,11 @@ class _ModalSearch:
         Such modes hardly reduce the cost at the start, and lose their damping in a descent. They
         would be fitted to a narrow line of the noise.
         """
-        cost_increases = self.evidence()
-        if cost_increases.min() >= _MIN_DEVIANCE_REDUCTION:
+        cost_increases = self.cost_increases_without_mode()
+        if cost_increases.min() >= _MIN_DEVIANCE_REDUCTION_BY_MODE:
             return self
-        is_undamped = self.descend_to_minimum().x[1::2] < 2 * _MIN_LOSS_FACTOR
-        return self._remove_modes((cost_increases < _MIN_DEVIANCE_REDUCTION) & is_undamped)
+        is_undamped = self.descend_to_minimum().mode_unknowns[1::2] < 2 * _MIN_LOSS_FACTOR
+        return self._remove_modes((cost_increases < _MIN_DEVIANCE_REDUCTION_BY_MODE) & is_undamped)
 
     def remove_undamped_modes(self) -> _ModalSearch:
         """Return the search without modes that lost their damping: they are not in the record.
@@ -464,27 +492,32 @@ class _ModalSearch:
         torque small. The fit gives evidence for the mode nevertheless, because it estimates the
         incoherent part of angle and torque with the mode itself.
         """
-        is_undamped = self.x[1::2] < 2 * _MIN_LOSS_FACTOR
+        is_undamped = self.mode_unknowns[1::2] < 2 * _MIN_LOSS_FACTOR
         if is_undamped.all() or not is_undamped.any():
             return self
         search = self._remove_modes(is_undamped)
         return search.converge_with_noise().remove_undamped_modes()
 
-    def _remove_modes(self, removed: int | NDArray[np.bool_]) -> _ModalSearch:
-        """Return the search without modes: that at an index in `numbers`, or those of a mask."""
+    def _remove_modes(self, removed_modes: int | NDArray[np.bool_]) -> _ModalSearch:
+        """Return the search without the mode at an index, or without those of a mask."""
         return replace(
             self,
-            numbers=tuple(np.delete(self.numbers, removed).tolist()),
-            x=np.delete(self.x.reshape(-1, 2), removed, axis=0).ravel(),
+            mode_numbers=tuple(np.delete(self.mode_numbers, removed_modes).tolist()),
+            mode_unknowns=np.delete(
+                self.mode_unknowns.reshape(-1, 2), removed_modes, axis=0
+            ).ravel(),
         )
 
-    def evidence(self) -> NDArray[np.float64]:
+    def cost_increases_without_mode(self) -> NDArray[np.float64]:
         """Return the cost increase by the removal of each mode alone, without a descent, (n,)."""
         problem = self.problem()
-        full_cost = problem.cost(self.x)
-        without_mode = [self._remove_modes(i) for i in range(len(self.numbers))]
+        full_cost = problem.cost(self.mode_unknowns)
+        searches_without_mode = [self._remove_modes(i) for i in range(len(self.mode_numbers))]
         return np.array(
-            [problem.for_modes(each.numbers).cost(each.x) - full_cost for each in without_mode]
+            [
+                problem.for_modes(search.mode_numbers).cost(search.mode_unknowns) - full_cost
+                for search in searches_without_mode
+            ]
         )
 
     def residual_dependence_on_angle(self, whitened_residual: NDArray[np.float64]) -> InputRelation:
@@ -493,12 +526,12 @@ class _ModalSearch:
         angle_spectrum = self.comparison.spectrum(
             self.comparison.angle_rad[self.comparison.retained_samples]
         )
-        used_bins = self.noise.is_compared
-        first_used_bin = int(np.argmax(used_bins))
+        is_compared = self.noise.is_compared
+        first_compared_bin = int(np.argmax(is_compared))
         return input_relation(
-            residual[first_used_bin:],
-            angle_spectrum[first_used_bin:],
-            self.comparison.frequency_hz[first_used_bin:],
+            residual[first_compared_bin:],
+            angle_spectrum[first_compared_bin:],
+            self.comparison.frequency_hz[first_compared_bin:],
         )
 
     def fit(self) -> ModalFit | None:
@@ -506,43 +539,45 @@ class _ModalSearch:
 
         Return None if no mode remains. The removed modes are undetermined.
         """
-        frequency_order = np.argsort(self.x[::2])
+        frequency_order = np.argsort(self.mode_unknowns[::2])
         search = replace(
             self,
-            x=self.x.reshape(-1, 2)[frequency_order].ravel(),
-            numbers=tuple(self.numbers[i] for i in frequency_order),
+            mode_unknowns=self.mode_unknowns.reshape(-1, 2)[frequency_order].ravel(),
+            mode_numbers=tuple(self.mode_numbers[i] for i in frequency_order),
         )
-        cost_increases = search.evidence()
-        while cost_increases.size and cost_increases.min() < _MIN_DEVIANCE_REDUCTION:
+        cost_increases = search.cost_increases_without_mode()
+        while cost_increases.size and cost_increases.min() < _MIN_DEVIANCE_REDUCTION_BY_MODE:
             search = search._remove_modes(int(np.argmin(cost_increases))).descend_to_minimum()
-            cost_increases = search.evidence()
+            cost_increases = search.cost_increases_without_mode()
         if not cost_increases.size:
             return None
-        x, numbers = search.x, search.numbers
+        mode_unknowns, mode_numbers = search.mode_unknowns, search.mode_numbers
         problem = search.problem()
-        residual, linear_parameters = problem.best_fit(x)
-        uncertainty = problem.uncertainty(x, linear_parameters)
+        residual, linear_parameters = problem.residual_and_linear_parameters(mode_unknowns)
+        uncertainty = problem.uncertainty(mode_unknowns, linear_parameters)
         joint_covariance = uncertainty.covariance
-        constants, covariance = problem.constants(linear_parameters, x, joint_covariance)
+        mode_constants, covariance = problem.constants_with_covariance(
+            linear_parameters, mode_unknowns, joint_covariance
+        )
         residual_spectrum = residual.view(np.complex128)
-        used_bins = search.noise.is_compared
+        is_compared = search.noise.is_compared
         effect_count = len(search.effect_spectra)
         effect_variances = np.diag(joint_covariance)[joint_covariance.shape[0] - effect_count :]
         return ModalFit(
-            model=problem.model(x, linear_parameters),
-            numbers=numbers,
-            constants=constants,
+            model=problem.modal_model(mode_unknowns, linear_parameters),
+            mode_numbers=mode_numbers,
+            mode_constants=mode_constants,
             joint_covariance=covariance,
-            evidence=tuple(cost_increases.tolist()),
+            cost_increases_without_mode=tuple(cost_increases.tolist()),
             residual=residual_spectrum,
             noise=search.noise,
             whiteness=whiteness(
-                residual_spectrum[used_bins], search.comparison.frequency_hz[used_bins]
+                residual_spectrum[is_compared], search.comparison.frequency_hz[is_compared]
             ),
             input_relation=search.residual_dependence_on_angle(residual),
             ringing=problem.ringing(linear_parameters, joint_covariance),
-            derivatives=_DerivativeSpan(search, uncertainty.span),
-            ln_damping_by_torque=uncertainty.ln_damping_by_torque,
+            derivative_span=_DerivativeSpan(search, uncertainty.span_rows),
+            ln_damping_per_torque=uncertainty.ln_damping_per_torque,
             effect_sizes=tuple(linear_parameters[linear_parameters.size - effect_count :].tolist()),
             effect_stds=tuple(np.sqrt(effect_variances).tolist()),
         )
@@ -555,16 +590,16 @@ class _DerivativeSpan:
     with each fit.
     """
 
-    def __init__(self, search: _ModalSearch, rows: NDArray[np.float64]) -> None:
+    def __init__(self, search: _ModalSearch, span_rows: NDArray[np.float64]) -> None:
         self._search = search
-        self._rows = None if search.comparison.is_long else rows
+        self._rows = None if search.comparison.is_long else span_rows
 
-    def rows(self) -> NDArray[np.float64]:
+    def span_rows(self) -> NDArray[np.float64]:
         """Return the rows, shape (r, 2 K), with real and imaginary parts interleaved."""
         if self._rows is not None:
             return self._rows
         search = self._search
-        rows: NDArray[np.float64] = search.comparison.shared_result_cache.value_at(
-            search.x, lambda _x: search.span(), self
+        span_rows: NDArray[np.float64] = search.comparison.shared_result_cache.value_at(
+            search.mode_unknowns, lambda _mode_unknowns: search.derivative_span_rows(), self
         )
-        return rows
+        return span_rows

@@ -121,9 +121,9 @@ class ModalModel:
         poles, residues = [], []
         for ln_frequency, ln_damping_ratio, ln_residue, phase_rad in mode_constants:
             damping_ratio = math.exp(ln_damping_ratio)
-            damped_rad_s = 2 * math.pi * math.exp(ln_frequency)
+            damped_frequency_rad_s = 2 * math.pi * math.exp(ln_frequency)
             poles.append(
-                damped_rad_s
+                damped_frequency_rad_s
                 * complex(-damping_ratio / math.sqrt(1 - damping_ratio * damping_ratio), 1.0)
             )
             residues.append(1j * cmath.rect(math.exp(ln_residue), phase_rad))
@@ -153,54 +153,54 @@ class ModalEstimate:
     ----------
     model : ModalModel
         Poles, residues and background.
-    numbers : tuple of int
+    mode_numbers : tuple of int
         Number of each mode of the model among those of the beam, from 1; 0 for a resonance that
         does not belong to the beam.
-    constants : ndarray, shape (4 n,)
+    mode_constants : ndarray, shape (4 n,)
         `MODE_CONSTANT_NAMES` of each mode in turn; the phase is that of the residue divided by j.
     joint_covariance : ndarray, shape (4 n + 5, 4 n + 5)
         Covariance of the constants and the coefficients of the background.
     """
 
     model: ModalModel
-    numbers: tuple[int, ...]
-    constants: NDArray[np.float64]
+    mode_numbers: tuple[int, ...]
+    mode_constants: NDArray[np.float64]
     joint_covariance: NDArray[np.float64]
 
     @property
     def covariance(self) -> NDArray[np.float64]:
         """Return the covariance of the constants of all modes, shape (4 n, 4 n)."""
-        return self.joint_covariance[: self.constants.size, : self.constants.size]
+        return self.joint_covariance[: self.mode_constants.size, : self.mode_constants.size]
 
     @property
-    def visible(self) -> tuple[int, ...]:
+    def visible_mode_numbers(self) -> tuple[int, ...]:
         """Return the numbers of the beam modes that are visible in the data, in ascending order."""
-        return tuple(sorted(number for number in self.numbers if number))
+        return tuple(sorted(number for number in self.mode_numbers if number))
 
     @property
     def poles_rad_s(self) -> dict[int, complex]:
         """Return the upper pole of each mode of the beam in rad/s, by mode number."""
         return {
             number: pole
-            for number, pole in zip(self.numbers, self.model.poles_rad_s, strict=True)
+            for number, pole in zip(self.mode_numbers, self.model.poles_rad_s, strict=True)
             if number
         }
 
     def residue(self, mode_number: int) -> complex:
         """Return the residue at the upper pole of a mode, in N·m/s."""
-        return self.model.residues[self.numbers.index(mode_number)]
+        return self.model.residues[self.mode_numbers.index(mode_number)]
 
-    def rows(self, mode_numbers: Sequence[int]) -> NDArray[np.intp]:
-        """Return the indices of the constants of some modes in `constants`, shape (4 m,).
+    def constant_indices(self, mode_numbers: Sequence[int]) -> NDArray[np.intp]:
+        """Return the indices of the constants of some modes in `mode_constants`, shape (4 m,).
 
         Parameters
         ----------
         mode_numbers : sequence of int
             Numbers of m modes.
         """
-        mode_indices = np.arange(len(MODE_CONSTANT_NAMES))
+        offsets_in_mode = np.arange(len(MODE_CONSTANT_NAMES))
         constant_indices = [
-            mode_indices + mode_indices.size * self.numbers.index(mode_number)
+            offsets_in_mode + offsets_in_mode.size * self.mode_numbers.index(mode_number)
             for mode_number in mode_numbers
         ]
         return np.concatenate(constant_indices) if constant_indices else np.zeros(0, dtype=np.intp)
@@ -213,8 +213,8 @@ class ModalEstimate:
         mode_number : int
             Number of the mode.
         """
-        constant_indices = self.rows([mode_number])[:2]
-        frequency_hz, damping_ratio = np.exp(self.constants[constant_indices]).tolist()
+        constant_indices = self.constant_indices([mode_number])[:2]
+        frequency_hz, damping_ratio = np.exp(self.mode_constants[constant_indices]).tolist()
         relative_frequency_std, relative_ratio_std = np.sqrt(
             np.diag(self.covariance)[constant_indices]
         ).tolist()
@@ -226,7 +226,7 @@ class ModalEstimate:
             damping_ratio * relative_ratio_std,
         )
 
-    def inertia(self, mode_number: int) -> tuple[float, float]:
+    def effective_inertia(self, mode_number: int) -> tuple[float, float]:
         """Return the effective inertia of a mode in kg·m², and its relative standard deviation.
 
         Parameters
@@ -234,39 +234,43 @@ class ModalEstimate:
         mode_number : int
             Number of the mode.
         """
-        constant_indices = self.rows([mode_number])
+        constant_indices = self.constant_indices([mode_number])
         # The logarithm of the inertia is ln_residue - 3 ln_frequency, plus a constant.
-        constant_weights = np.zeros(len(MODE_CONSTANT_NAMES))
-        constant_weights[MODE_CONSTANT_NAMES.index("ln_frequency")] = -3.0
-        constant_weights[MODE_CONSTANT_NAMES.index("ln_residue")] = 1.0
+        ln_inertia_weights = np.zeros(len(MODE_CONSTANT_NAMES))
+        ln_inertia_weights[MODE_CONSTANT_NAMES.index("ln_frequency")] = -3.0
+        ln_inertia_weights[MODE_CONSTANT_NAMES.index("ln_residue")] = 1.0
         relative_std = math.sqrt(
             float(
-                constant_weights
+                ln_inertia_weights
                 @ self.covariance[np.ix_(constant_indices, constant_indices)]
-                @ constant_weights
+                @ ln_inertia_weights
             )
         )
-        return self.model.effective_inertias_kg_m2[self.numbers.index(mode_number)], relative_std
+        return self.model.effective_inertias_kg_m2[
+            self.mode_numbers.index(mode_number)
+        ], relative_std
 
-    def uniform_plant(self, nominal: Plant) -> Plant:
+    def uniform_plant(self, nominal_plant: Plant) -> Plant:
         """Return a rig whose uniform beam has the inertias and frequencies of the modes on average.
 
-        The highest mode determines the damping. Return `nominal` if no mode is visible.
+        The highest mode determines the damping. Return `nominal_plant` if no mode is visible.
 
         Parameters
         ----------
-        nominal : Plant
+        nominal_plant : Plant
             Rig and specimen as the file states them.
         """
-        mode_numbers, length_m = self.visible, nominal.beam.length_m
+        mode_numbers, length_m = self.visible_mode_numbers, nominal_plant.beam.length_m
         if not mode_numbers:
-            return nominal
-        inertia_per_density = participation(nominal.beam, mode_numbers[-1])
+            return nominal_plant
+        inertia_per_density = participation(nominal_plant.beam, mode_numbers[-1])
         eigenvalues = clamped_free_eigenvalues(mode_numbers[-1])
         ln_density, ln_stiffness = np.mean(
             [
                 (
-                    ln_density := math.log(self.inertia(n)[0] / inertia_per_density[n - 1]),
+                    ln_density := math.log(
+                        self.effective_inertia(n)[0] / inertia_per_density[n - 1]
+                    ),
                     ln_density
                     + 2 * math.log(abs(self.poles_rad_s[n]))
                     - 4 * math.log(eigenvalues[n - 1] / length_m),
@@ -277,7 +281,7 @@ class ModalEstimate:
         ).tolist()
         highest_pole = self.poles_rad_s[mode_numbers[-1]]
         return replace(
-            nominal,
+            nominal_plant,
             beam=Beam(length_m, math.exp(ln_density), math.exp(ln_stiffness)),
             damping=Damping(zeta=-2 * highest_pole.real / abs(highest_pole) ** 2),
         )
@@ -285,11 +289,11 @@ class ModalEstimate:
     def restrict_to_visible_modes(self) -> ModalEstimate:
         """Return the modal model restricted to the visible modes, with the same background."""
         constant_indices, mode_indices = (
-            self.rows(self.visible),
-            [self.numbers.index(n) for n in self.visible],
+            self.constant_indices(self.visible_mode_numbers),
+            [self.mode_numbers.index(n) for n in self.visible_mode_numbers],
         )
         joint_indices = np.concatenate(
-            [constant_indices, self.constants.size + np.arange(BACKGROUND_COEFFICIENTS)]
+            [constant_indices, self.mode_constants.size + np.arange(BACKGROUND_COEFFICIENTS)]
         )
         return ModalEstimate(
             ModalModel(
@@ -297,8 +301,8 @@ class ModalEstimate:
                 tuple(self.model.residues[mode_index] for mode_index in mode_indices),
                 self.model.background,
             ),
-            self.visible,
-            self.constants[constant_indices],
+            self.visible_mode_numbers,
+            self.mode_constants[constant_indices],
             self.joint_covariance[np.ix_(joint_indices, joint_indices)],
         )
 
@@ -306,7 +310,7 @@ class ModalEstimate:
         """Return model, mode numbers and covariance as a dictionary for `json.dumps`."""
         constant_names = [
             f"{constant_name}_{k}"
-            for k in range(1, len(self.numbers) + 1)
+            for k in range(1, len(self.mode_numbers) + 1)
             for constant_name in MODE_CONSTANT_NAMES
         ]
         constant_names += [
@@ -314,8 +318,8 @@ class ModalEstimate:
         ]
         return {
             **self.model.as_json(),
-            "modes": list(self.numbers),
-            "constants": self.constants.tolist(),
+            "modes": list(self.mode_numbers),
+            "constants": self.mode_constants.tolist(),
             "names": constant_names,
             "covariance": self.joint_covariance.tolist(),
         }

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
 
-_COLUMNS_AT_ONCE: Final = 1 << 14
+_COLUMNS_PER_BLOCK: Final = 1 << 14
 """Number of columns of the rows of a long record that are processed at once."""
 
 
 def column_blocks(column_count: int) -> Iterator[slice]:
     """Yield the ranges of columns that are processed at once: all, unless the record is long."""
-    is_long = column_count > 2 * MAX_BINS_OF_STORED_RESULTS
-    block_columns = _COLUMNS_AT_ONCE if is_long else max(column_count, 1)
-    for first_column in range(0, column_count, block_columns):
-        yield slice(first_column, min(first_column + block_columns, column_count))
+    is_long_record = column_count > 2 * MAX_BINS_OF_STORED_RESULTS
+    columns_per_block = _COLUMNS_PER_BLOCK if is_long_record else max(column_count, 1)
+    for first_column in range(0, column_count, columns_per_block):
+        yield slice(first_column, min(first_column + columns_per_block, column_count))
 
 
 def _scaled_gram(
@@ -48,14 +48,14 @@ def _scaled_gram(
     """
     row_count = sum(len(matrix) for matrix in matrices)
     row_squares, gram = np.zeros(row_count), np.zeros((row_count, row_count))
-    blocks = list(column_blocks(matrices[0].shape[1]))
-    for columns in blocks:
+    column_ranges = list(column_blocks(matrices[0].shape[1]))
+    for columns in column_ranges:
         row_squares += np.concatenate(
             [np.einsum("ij,ij->i", matrix[:, columns], matrix[:, columns]) for matrix in matrices]
         )
     row_lengths = np.sqrt(row_squares)
     row_lengths[row_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
-    for columns in blocks:
+    for columns in column_ranges:
         unit_rows = np.concatenate([matrix[:, columns] for matrix in matrices])
         unit_rows /= row_lengths[:, None]
         gram += unit_rows @ unit_rows.T
@@ -63,26 +63,26 @@ def _scaled_gram(
     return gram, row_lengths
 
 
-def _orthonormalise(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def _orthonormalise(rows_to_change: NDArray[np.float64]) -> NDArray[np.float64]:
     """Replace rows, in place, by orthonormal rows with the same span.
 
     Return the matrix whose product with the orthonormal rows restores the given rows.
     """
-    gram, row_lengths = _scaled_gram(rows, regularization=1e-13)
-    triangular_factor = np.linalg.cholesky(gram)
+    gram, row_lengths = _scaled_gram(rows_to_change, regularization=1e-13)
+    cholesky_factor = np.linalg.cholesky(gram)
     # A product takes a third of the time of a solution for many columns.
-    orthonormalising_matrix = np.linalg.inv(triangular_factor) / row_lengths
-    for columns in column_blocks(rows.shape[1]):
-        rows[:, columns] = orthonormalising_matrix @ rows[:, columns]
-    restoring_matrix: NDArray[np.float64] = triangular_factor * row_lengths[:, None]
+    orthonormalising_matrix = np.linalg.inv(cholesky_factor) / row_lengths
+    for columns in column_blocks(rows_to_change.shape[1]):
+        rows_to_change[:, columns] = orthonormalising_matrix @ rows_to_change[:, columns]
+    restoring_matrix: NDArray[np.float64] = cholesky_factor * row_lengths[:, None]
     return restoring_matrix
 
 
-def _remove_span(rows: NDArray[np.float64], span: NDArray[np.float64]) -> None:
-    """Subtract from `rows`, in place, their projections on the orthonormal rows of `span`."""
-    coefficients = rows @ span.T
-    for columns in column_blocks(rows.shape[1]):
-        rows[:, columns] -= coefficients @ span[:, columns]
+def _remove_span(rows_to_change: NDArray[np.float64], span_rows: NDArray[np.float64]) -> None:
+    """Subtract from rows, in place, their projections on the orthonormal rows `span_rows`."""
+    coefficients = rows_to_change @ span_rows.T
+    for columns in column_blocks(rows_to_change.shape[1]):
+        rows_to_change[:, columns] -= coefficients @ span_rows[:, columns]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,27 +103,27 @@ class _LinearSolution:
 class _Uncertainty:
     """Uncertainty of the modal model at a minimum.
 
-    `covariance` is that of frequencies, damping and linear parameters together. `span` are
-    orthonormal rows that span all derivatives of the residual. `ln_damping_by_torque`, shape
+    `covariance` is that of frequencies, damping and linear parameters together. `span_rows` are
+    orthonormal rows that span all derivatives of the residual. `ln_damping_per_torque`, shape
     (n, 2 K), is the derivative of the logarithm of each eta by the whitened torque.
     """
 
     covariance: NDArray[np.float64]
-    span: NDArray[np.float64]
-    ln_damping_by_torque: NDArray[np.float64]
+    span_rows: NDArray[np.float64]
+    ln_damping_per_torque: NDArray[np.float64]
 
 
-def _ln_damping_by_torque(
-    jacobian: NDArray[np.float64], x: NDArray[np.float64]
+def _ln_damping_per_torque(
+    jacobian: NDArray[np.float64], mode_unknowns: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the derivative of each ln(eta) at a minimum `x` by the whitened torque, (n, 2 K)."""
+    """Return the derivative of each ln(eta) at a minimum by the whitened torque, shape (n, 2 K)."""
     gram, row_lengths = _scaled_gram(jacobian, regularization=1e-14)
-    derivatives = np.empty((x.size // 2, jacobian.shape[1]))
+    derivatives = np.empty((mode_unknowns.size // 2, jacobian.shape[1]))
     for columns in column_blocks(jacobian.shape[1]):
         # The residual is predicted minus measured: the torque enters it with the opposite sign.
         unit_rows = jacobian[:, columns] / row_lengths[:, None]
-        x_by_torque = np.linalg.solve(gram, unit_rows) / row_lengths[:, None]
-        derivatives[:, columns] = x_by_torque[1::2] / x[1::2, None]
+        unknowns_per_torque = np.linalg.solve(gram, unit_rows) / row_lengths[:, None]
+        derivatives[:, columns] = unknowns_per_torque[1::2] / mode_unknowns[1::2, None]
     return derivatives
 
 
@@ -146,16 +146,16 @@ class ModalProblem:
     def __init__(
         self,
         comparison: Comparison,
-        weight: NDArray[np.float64],
+        noise_weight: NDArray[np.float64],
         effect_spectra: NDArray[np.complex128],
-        numbers: tuple[int, ...],
+        mode_numbers: tuple[int, ...],
     ) -> None:
         self._recent: RecentValues[_LinearSolution] = (
             comparison.shared_result_cache if comparison.is_long else RecentValues()
         )
-        self._numbers = numbers
+        self._numbers = mode_numbers
         self._comparison = comparison
-        self._weight = weight
+        self._weight = noise_weight
         self._effect_spectra = effect_spectra
         self._s = comparison.torque_predictor.s
         self.scale_rad_s = 2 * math.pi * float(comparison.frequency_hz[-1])
@@ -167,10 +167,10 @@ class ModalProblem:
         )
         self._background = self._predicted_spectra(background_responses)
 
-    def for_modes(self, numbers: tuple[int, ...]) -> ModalProblem:
+    def for_modes(self, mode_numbers: tuple[int, ...]) -> ModalProblem:
         """Return the problem of other modes of the same record."""
         problem = copy(self)
-        problem._numbers = numbers
+        problem._numbers = mode_numbers
         if not self._comparison.is_long:
             problem._recent = RecentValues()
         return problem
@@ -190,15 +190,15 @@ class ModalProblem:
             predicted_spectra[rows] = self._whiten(comparison.spectrum(torque_nm))
         return predicted_spectra
 
-    def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
+    def _poles(self, mode_unknowns: NDArray[np.float64]) -> list[Pole]:
         """Return the poles of the modes, with their derivatives by frequencies and damping.
 
-        `x` is ``(ln omega_1, eta_1, ln omega_2, …)``.
+        `mode_unknowns` is ``(ln omega_1, eta_1, ln omega_2, …)``.
         """
         poles = []
-        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+        for k, (log_omega, eta) in enumerate(mode_unknowns.reshape(-1, 2)):
             omega_rad_s, q = math.exp(log_omega), _relative_pole(eta)
-            pole_derivative = np.zeros(x.size, dtype=np.complex128)
+            pole_derivative = np.zeros(mode_unknowns.size, dtype=np.complex128)
             pole_derivative[2 * k] = omega_rad_s * q
             pole_derivative[2 * k + 1] = omega_rad_s * _relative_pole_derivative(eta)
             poles.append(Pole(self._numbers[k], omega_rad_s * q, pole_derivative))
@@ -211,69 +211,77 @@ class ModalProblem:
         """
         return self._comparison.nuisance_spectra(poles, self._effect_spectra)
 
-    def solution_at(self, x: NDArray[np.float64]) -> _LinearSolution:
-        """Return the best linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
+    def solution_at(self, mode_unknowns: NDArray[np.float64]) -> _LinearSolution:
+        """Return the best linear parameters at a point ``(ln omega_1, eta_1, ln omega_2, …)``.
 
         The solutions at the last points are cached.
         """
-        return self._recent.value_at(x, self._solve_at, self if self._comparison.is_long else None)
+        return self._recent.value_at(
+            mode_unknowns, self._solve_at, self if self._comparison.is_long else None
+        )
 
-    def _solve_at(self, x: NDArray[np.float64]) -> _LinearSolution:
-        """Return the best linear parameters at a point `x`, computed without the cache."""
-        span = self._linear_spectra(x)
-        residual, linear_parameters = self._solve(x, span)
-        jacobian = np.empty((x.size, residual.size))
-        self._write_jacobian(x, linear_parameters, jacobian)
-        _remove_span(jacobian, span)
+    def _solve_at(self, mode_unknowns: NDArray[np.float64]) -> _LinearSolution:
+        """Return the best linear parameters at a point, computed without the cache."""
+        linear_spectra = self._linear_spectra(mode_unknowns)
+        residual, linear_parameters = self._solve(mode_unknowns, linear_spectra)
+        jacobian = np.empty((mode_unknowns.size, residual.size))
+        self._write_jacobian(mode_unknowns, linear_parameters, jacobian)
+        _remove_span(jacobian, linear_spectra)
         return _LinearSolution(residual, linear_parameters, jacobian)
 
-    def best_fit(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the whitened residual and the best linear parameters at a point `x`."""
+    def residual_and_linear_parameters(
+        self, mode_unknowns: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the whitened residual and the best linear parameters at a point."""
         if self._comparison.is_long:
             self._recent.clear()
-        return self._solve(x, self._linear_spectra(x))
+        return self._solve(mode_unknowns, self._linear_spectra(mode_unknowns))
 
-    def cost(self, x: NDArray[np.float64]) -> float:
-        """Return the sum of the squared whitened residual at a point `x`."""
-        residual, _ = self.best_fit(x)
+    def cost(self, mode_unknowns: NDArray[np.float64]) -> float:
+        """Return the sum of the squared whitened residual at a point."""
+        residual, _ = self.residual_and_linear_parameters(mode_unknowns)
         return float(residual @ residual)
 
     def uncertainty(
-        self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64]
+        self, mode_unknowns: NDArray[np.float64], linear_parameters: NDArray[np.float64]
     ) -> _Uncertainty:
-        """Return covariance and derivatives at a minimum `x` with its linear parameters."""
+        """Return covariance and derivatives at a minimum with its linear parameters."""
         if self._comparison.is_long:
             self._recent.clear()
-        rows = self._linear_spectra(x, x.size)
-        spectra, jacobian = rows[: -x.size], rows[-x.size :]
-        self._write_jacobian(x, linear_parameters, jacobian)
+        rows = self._linear_spectra(mode_unknowns, mode_unknowns.size)
+        spectra, jacobian = rows[: -mode_unknowns.size], rows[-mode_unknowns.size :]
+        self._write_jacobian(mode_unknowns, linear_parameters, jacobian)
         gram, row_lengths = _scaled_gram(jacobian, spectra, regularization=1e-14)
         covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(row_lengths, row_lengths)
         # From here on in place: the rows of a long record take much memory.
         _orthonormalise(spectra)
         _remove_span(jacobian, spectra)
-        ln_damping_by_torque = _ln_damping_by_torque(jacobian, x)
+        ln_damping_per_torque = _ln_damping_per_torque(jacobian, mode_unknowns)
         _orthonormalise(jacobian)
-        return _Uncertainty(covariance, rows, ln_damping_by_torque)
+        return _Uncertainty(covariance, rows, ln_damping_per_torque)
 
-    def _linear_spectra(self, x: NDArray[np.float64], further_rows: int = 0) -> NDArray[np.float64]:
+    def _linear_spectra(
+        self, mode_unknowns: NDArray[np.float64], appended_row_count: int = 0
+    ) -> NDArray[np.float64]:
         """Return the whitened spectra that the linear parameters multiply, shape (m, 2 K).
 
         They are those of the numerators of the modes, of the background and of the nuisances, in
-        this order. `further_rows` is the number of rows without values that are appended.
+        this order. `appended_row_count` is the number of rows without values that are appended.
         """
-        nuisance_spectra = self._nuisance_spectra(self._poles(x))
-        nuisance_start = x.size + BACKGROUND_COEFFICIENTS
+        nuisance_spectra = self._nuisance_spectra(self._poles(mode_unknowns))
+        nuisance_start = mode_unknowns.size + BACKGROUND_COEFFICIENTS
         nuisance_end = nuisance_start + len(nuisance_spectra)
-        rows = np.empty((nuisance_end + further_rows, 2 * self._weight.size))
-        for row, spectrum in zip(rows[nuisance_start:nuisance_end], nuisance_spectra, strict=True):
+        spectrum_rows = np.empty((nuisance_end + appended_row_count, 2 * self._weight.size))
+        for row, spectrum in zip(
+            spectrum_rows[nuisance_start:nuisance_end], nuisance_spectra, strict=True
+        ):
             row[:] = self._whiten(spectrum)
         del nuisance_spectra
-        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+        for k, (log_omega, eta) in enumerate(mode_unknowns.reshape(-1, 2)):
             _, _, numerators = self._numerators(log_omega, eta)
-            rows[2 * k : 2 * k + 2] = self._predicted_spectra(numerators)
-        rows[x.size : nuisance_start] = self._background
-        return rows
+            spectrum_rows[2 * k : 2 * k + 2] = self._predicted_spectra(numerators)
+        spectrum_rows[mode_unknowns.size : nuisance_start] = self._background
+        return spectrum_rows
 
     def _numerators(
         self, log_omega: float, eta: float
@@ -284,60 +292,64 @@ class ModalProblem:
         return q, inverse_denominator, (q * q * inverse_denominator, q**3 * inverse_denominator)
 
     def _solve(
-        self, x: NDArray[np.float64], spectra: NDArray[np.float64]
+        self, mode_unknowns: NDArray[np.float64], linear_spectra: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return residual and best linear parameters at the nonlinear parameters `x`.
+        """Return residual and best linear parameters at given nonlinear parameters.
 
-        The `spectra` of the linear parameters are made orthonormal in place.
+        The `linear_spectra` of the linear parameters are made orthonormal in place.
         """
-        triangular_factor = _orthonormalise(spectra)
+        restoring_matrix = _orthonormalise(linear_spectra)
         measured_torque = self._measured_torque
         if (drag := self._comparison.drag) is not None:
-            drag_change, _ = drag.torque_change_by_poles(self._poles(x), x.size)
-            measured_torque = measured_torque - self._whiten(drag_change)
-        projections = spectra @ measured_torque
-        residual: NDArray[np.float64] = projections @ spectra - measured_torque
-        linear_parameters = np.linalg.solve(triangular_factor.T, projections)
+            drag_torque_change, _ = drag.torque_change_by_poles(
+                self._poles(mode_unknowns), mode_unknowns.size
+            )
+            measured_torque = measured_torque - self._whiten(drag_torque_change)
+        projections = linear_spectra @ measured_torque
+        residual: NDArray[np.float64] = projections @ linear_spectra - measured_torque
+        linear_parameters = np.linalg.solve(restoring_matrix.T, projections)
         return residual, linear_parameters.astype(np.float64, copy=False)
 
     def _write_jacobian(
         self,
-        x: NDArray[np.float64],
+        mode_unknowns: NDArray[np.float64],
         linear_parameters: NDArray[np.float64],
         jacobian: NDArray[np.float64],
     ) -> None:
-        """Write the derivatives of the whitened residual by `x` into an array, shape (k, 2 K)."""
-        poles = self._poles(x)
+        """Write the derivatives of the whitened residual by the unknowns to an array, (k, 2 K)."""
+        poles = self._poles(mode_unknowns)
         jacobian[:] = 0.0
         if (drag := self._comparison.drag) is not None:
-            jacobian[:] = self._whiten(drag.torque_change_by_poles(poles, x.size)[1])
+            jacobian[:] = self._whiten(drag.torque_change_by_poles(poles, mode_unknowns.size)[1])
         if poles:
-            nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
+            nuisance_amplitudes = linear_parameters[mode_unknowns.size + BACKGROUND_COEFFICIENTS :]
             decay_gradient = self._comparison.decay_gradient(poles, nuisance_amplitudes)
             for k, derivative in enumerate(decay_gradient):
                 jacobian[k] += self._whiten(derivative)
             del decay_gradient
-        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+        for k, (log_omega, eta) in enumerate(mode_unknowns.reshape(-1, 2)):
             q, inverse_denominator, numerators = self._numerators(log_omega, eta)
             a, b = linear_parameters[2 * k : 2 * k + 2]
-            response = a * numerators[0] + b * numerators[1]
+            mode_response = a * numerators[0] + b * numerators[1]
             denominator_by_ln_omega = (eta * q + 2 * q * q) * inverse_denominator
             jacobian[2 * k : 2 * k + 2] += self._predicted_spectra(
                 [
-                    response * (denominator_by_ln_omega - 2) - b * numerators[1],
-                    -response * q * inverse_denominator,
+                    mode_response * (denominator_by_ln_omega - 2) - b * numerators[1],
+                    -mode_response * q * inverse_denominator,
                 ]
             )
 
-    def model(self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64]) -> ModalModel:
+    def modal_model(
+        self, mode_unknowns: NDArray[np.float64], linear_parameters: NDArray[np.float64]
+    ) -> ModalModel:
         """Return the modal model with given frequencies, damping and linear parameters."""
-        mode_points = x.reshape(-1, 2)
+        unknowns_by_mode = mode_unknowns.reshape(-1, 2)
         poles, residues = [], []
-        background_start = 2 * len(mode_points)
+        background_start = 2 * len(unknowns_by_mode)
         background_coefficients = linear_parameters[
             background_start : background_start + BACKGROUND_COEFFICIENTS
         ] / self.scale_rad_s ** np.arange(BACKGROUND_COEFFICIENTS)
-        for k, (log_omega, eta) in enumerate(mode_points):
+        for k, (log_omega, eta) in enumerate(unknowns_by_mode):
             omega_rad_s, (a, b) = math.exp(log_omega), linear_parameters[2 * k : 2 * k + 2]
             q = _relative_pole(eta)
             poles.append(omega_rad_s * q)
@@ -347,19 +359,22 @@ class ModalProblem:
             background_coefficients[1] += b / omega_rad_s
         return ModalModel(tuple(poles), tuple(residues), tuple(background_coefficients.tolist()))
 
-    def residual(
-        self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64], model: ModalModel
+    def residual_spectrum(
+        self,
+        mode_unknowns: NDArray[np.float64],
+        linear_parameters: NDArray[np.float64],
+        model: ModalModel,
     ) -> NDArray[np.complex128]:
         """Return the residual spectrum of a model in N·m, not whitened, shape (K,)."""
-        nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
-        poles = self._poles(x)
+        nuisance_amplitudes = linear_parameters[mode_unknowns.size + BACKGROUND_COEFFICIENTS :]
+        poles = self._poles(mode_unknowns)
         comparison = self._comparison
         predicted_nm = comparison.torque_predictor.torque(model)[0]
         modal_residual = comparison.spectrum(
             predicted_nm - comparison.torque_nm[comparison.retained_samples]
         )
         if comparison.drag is not None:
-            modal_residual += comparison.drag.torque_change_by_poles(poles, x.size)[0]
+            modal_residual += comparison.drag.torque_change_by_poles(poles, mode_unknowns.size)[0]
         return modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
 
     def ringing(
@@ -384,28 +399,28 @@ class ModalProblem:
             degrees_of_freedom=decay_amplitudes.size,
         )
 
-    def constants(
+    def constants_with_covariance(
         self,
         linear_parameters: NDArray[np.float64],
-        x: NDArray[np.float64],
+        mode_unknowns: NDArray[np.float64],
         covariance: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the constants of all modes, and their covariance with the background coefficients.
 
         The constants are `MODE_CONSTANT_NAMES`. The shapes are (4 n,) and (4 n + 5, 4 n + 5).
         """
-        mode_count = x.size // 2
+        mode_count = mode_unknowns.size // 2
         mode_constants = np.empty(4 * mode_count)
-        background_start = x.size + 2 * mode_count
+        background_start = mode_unknowns.size + 2 * mode_count
         derivatives = np.zeros(
             (4 * mode_count + BACKGROUND_COEFFICIENTS, background_start + BACKGROUND_COEFFICIENTS)
         )
-        background_rows = derivatives[4 * mode_count :]
-        background_rows[:, background_start:] = np.diag(
+        background_derivatives = derivatives[4 * mode_count :]
+        background_derivatives[:, background_start:] = np.diag(
             self.scale_rad_s ** -np.arange(float(BACKGROUND_COEFFICIENTS))
         )
         for k in range(mode_count):
-            log_omega, eta = x[2 * k : 2 * k + 2]
+            log_omega, eta = mode_unknowns[2 * k : 2 * k + 2]
             a, b = linear_parameters[2 * k : 2 * k + 2]
             q = _relative_pole(eta)
             residue_numerator = a + b * q
@@ -422,35 +437,37 @@ class ModalProblem:
                 log_residue.real,
                 log_residue.imag,
             )
-            mode_rows = derivatives[4 * k : 4 * k + 4]
+            mode_derivatives = derivatives[4 * k : 4 * k + 4]
             omega_index, eta_index, a_index, b_index = (
                 2 * k,
                 2 * k + 1,
-                x.size + 2 * k,
-                x.size + 2 * k + 1,
+                mode_unknowns.size + 2 * k,
+                mode_unknowns.size + 2 * k + 1,
             )
-            mode_rows[0, [omega_index, eta_index]] = 1.0, pole_derivative.imag / q.imag
-            mode_rows[1, eta_index] = 1 / eta
-            mode_rows[2, [omega_index, eta_index, a_index, b_index]] = (
+            mode_derivatives[0, [omega_index, eta_index]] = 1.0, pole_derivative.imag / q.imag
+            mode_derivatives[1, eta_index] = 1 / eta
+            mode_derivatives[2, [omega_index, eta_index, a_index, b_index]] = (
                 1.0,
                 residue_by_eta.real,
                 residue_by_a.real,
                 residue_by_b.real,
             )
-            mode_rows[3, [eta_index, a_index, b_index]] = (
+            mode_derivatives[3, [eta_index, a_index, b_index]] = (
                 residue_by_eta.imag,
                 residue_by_a.imag,
                 residue_by_b.imag,
             )
             # The remainder of the division of the numerator by the denominator, as in `model`.
-            background_rows[0, [a_index, b_index, eta_index]] = 1.0, -eta, -b
-            background_rows[1, [b_index, omega_index]] = np.array([1.0, -b]) / math.exp(log_omega)
+            background_derivatives[0, [a_index, b_index, eta_index]] = 1.0, -eta, -b
+            background_derivatives[1, [b_index, omega_index]] = np.array([1.0, -b]) / math.exp(
+                log_omega
+            )
         used_covariance = covariance[: derivatives.shape[1], : derivatives.shape[1]]
         return mode_constants, derivatives @ used_covariance @ derivatives.T
 
-    def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
-        """Return cost, gradient and Hessian at a point `x`, with Kaufman's Jacobian."""
-        solution = self.solution_at(x)
+    def normal_equations(self, mode_unknowns: NDArray[np.float64]) -> NormalEquations:
+        """Return cost, gradient and Hessian at a point, with Kaufman's Jacobian."""
+        solution = self.solution_at(mode_unknowns)
         return NormalEquations(
             cost=float(solution.residual @ solution.residual),
             gradient=solution.jacobian @ solution.residual,

@@ -31,10 +31,10 @@ MODES_WITHOUT_REDUNDANCY: Final = 2
 _CLIPPED_TORQUE_REASON: Final = "the torque is clipped"
 """Reason against all numbers if the torque is clipped."""
 
-_CONTRADICTING_KINDS: Final = frozenset({"sign", "unit", "implausible"})
+_KINDS_CONTRADICTING_FILE: Final = frozenset({"sign", "unit", "implausible"})
 """Kinds of findings which show that the record contradicts its file."""
 
-_CHANNEL_KINDS: Final = _CONTRADICTING_KINDS | {"clipping", "stop"}
+_KINDS_OF_CHANNEL_FAULTS: Final = _KINDS_CONTRADICTING_FILE | {"clipping", "stop"}
 """Kinds of findings that are reported even if the record contradicts its file."""
 
 
@@ -63,7 +63,7 @@ class ModelCheck:
     temporal_changes: tuple[TemporalChange, ...] = ()
 
     @classmethod
-    def run(
+    def of_candidates(
         cls,
         candidate_set: CandidateSet,
         modal_fit: ModalFit | None,
@@ -73,8 +73,8 @@ class ModelCheck:
     ) -> ModelCheck:
         """Check a model, including its nonlinear forces and changes along the record."""
         residual_tests = test_residual(candidate_set, modal_fit, band_hz)
-        found = findings(candidate_set, nonlinear_forces, residual_tests.harmonics)
-        return cls(candidate_set, modal_fit, residual_tests, found, temporal_changes)
+        model_findings = findings(candidate_set, nonlinear_forces, residual_tests.harmonics)
+        return cls(candidate_set, modal_fit, residual_tests, model_findings, temporal_changes)
 
     @property
     def finding_kinds(self) -> frozenset[str]:
@@ -84,10 +84,10 @@ class ModelCheck:
     @property
     def contradicts_file(self) -> bool:
         """Return whether a recorded signal has another sign, unit or scale than the file states."""
-        return not _CONTRADICTING_KINDS.isdisjoint(self.finding_kinds)
+        return not _KINDS_CONTRADICTING_FILE.isdisjoint(self.finding_kinds)
 
     @property
-    def model_reason(self) -> str | None:
+    def model_rejection_reason(self) -> str | None:
         """Return the reason why the record refutes the model; None if it does not."""
         if self.contradicts_file:
             return CONTRADICTED_FILE_REASON
@@ -96,14 +96,14 @@ class ModelCheck:
         return None
 
     @property
-    def clipped_reason(self) -> str | None:
+    def clipped_torque_reason(self) -> str | None:
         """Return the reason to doubt all numbers if the torque is clipped, else None."""
         return _CLIPPED_TORQUE_REASON if "clipping" in self.finding_kinds else None
 
     @property
     def doubt_reason(self) -> str | None:
         """Return the reason to doubt every number; None if there is none."""
-        return self.model_reason or self.clipped_reason or self._change_reason
+        return self.model_rejection_reason or self.clipped_torque_reason or self._change_reason
 
     @property
     def mode_doubt_reason(self) -> str | None:
@@ -114,7 +114,7 @@ class ModelCheck:
         """
         if self.temporal_changes and self.temporal_changes[0].is_certain:
             return self.doubt_reason
-        return self.model_reason or self.clipped_reason
+        return self.model_rejection_reason or self.clipped_torque_reason
 
     @property
     def _change_reason(self) -> str | None:
@@ -143,28 +143,30 @@ class ModelCheck:
         themselves. `stiffness_step` may explain the residual.
         """
         if self.contradicts_file:
-            return tuple(finding for finding in self.findings if finding.kind in _CHANNEL_KINDS)
+            return tuple(
+                finding for finding in self.findings if finding.kind in _KINDS_OF_CHANNEL_FAULTS
+            )
         marked_findings = mark_doubtful_findings(
             (*self.findings, *self._setting_findings(headline), *effect_findings),
             change_findings,
-            self.model_reason,
+            self.model_rejection_reason,
             self.doubt_reason,
             headline.flags,
             only_harmonics_remain=self.residual_tests.is_noise,
         )
-        impacts = impact_findings(
+        findings_on_impacts = impact_findings(
             self.candidate_set.comparison.measurement.impacts,
             is_explained=self.residual_tests.is_noise,
         )
         if self.residual_tests.is_noise:
-            return (*impacts, *marked_findings)
+            return (*findings_on_impacts, *marked_findings)
         residual_finding = unexplained_residual_finding(
             self.residual_tests.whiteness,
             self.residual_tests.input_relation,
             self.candidate_set.best.fit.modes,
             stiffness_step,
         )
-        return (*impacts, *marked_findings, residual_finding)
+        return (*findings_on_impacts, *marked_findings, residual_finding)
 
     def _setting_findings(self, headline: Headline) -> tuple[Finding, ...]:
         """Return findings on fitted settings, such as the delay, that differ from the file's.
@@ -185,13 +187,13 @@ def visible_mode_numbers(
     """Return the numbers of the beam modes that are visible in a record, from 1."""
     if modal_fit is None:
         return visible_modes(candidate_set.comparison, candidate_set.noise, candidate_set.best.fit)
-    return modal_fit.visible
+    return modal_fit.visible_mode_numbers
 
 
 def mark_doubtful_findings(
     fitted_findings: tuple[Finding, ...],
     change_findings: tuple[Finding, ...],
-    model_reason: str | None,
+    model_rejection_reason: str | None,
     doubt_reason: str | None,
     parameter_flags: Mapping[str, str],
     *,
@@ -200,12 +202,13 @@ def mark_doubtful_findings(
     """Return all findings, with the doubtful ones marked as not established.
 
     `fitted_findings` are effects that were fitted with the beam. `change_findings` are changes
-    along the record, which already state their certainty. `model_reason` is the reason against the
-    model, `doubt_reason` the reason against all numbers, and `parameter_flags` are the reasons
-    against single parameters. With `only_harmonics_remain` the finding on harmonics is established.
+    along the record, which already state their certainty. `model_rejection_reason` is the reason
+    against the model, `doubt_reason` the reason against all numbers, and `parameter_flags` are the
+    reasons against single parameters. With `only_harmonics_remain` the finding on harmonics is
+    established.
     """
 
-    def qualified(finding: Finding) -> Finding:
+    def with_reason_of_doubt(finding: Finding) -> Finding:
         """Mark a finding as not established if a reason against it exists."""
         parameter_flag = next(
             (
@@ -220,7 +223,9 @@ def mark_doubtful_findings(
             return finding
         return with_doubt(finding, finding_reason)
 
-    fitted_findings = tuple(map(qualified, fitted_findings))
-    if model_reason is not None:
-        change_findings = tuple(with_doubt(finding, model_reason) for finding in change_findings)
+    fitted_findings = tuple(map(with_reason_of_doubt, fitted_findings))
+    if model_rejection_reason is not None:
+        change_findings = tuple(
+            with_doubt(finding, model_rejection_reason) for finding in change_findings
+        )
     return (*fitted_findings, *change_findings)

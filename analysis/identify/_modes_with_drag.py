@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._finding import Finding
-from analysis.identify._modal_fit import fit_modes, modes_with_poles
+from analysis.identify._modal_fit import fit_modes, fit_with_given_poles
 from analysis.identify.drag_torque import DragError, DragLaw
 from rigd.units import rounded_to_uncertainty
 
@@ -46,21 +46,21 @@ _MIN_DRAG_STDS: Final = 5.0
 """Ratio of `_SMALLEST_DRAG_M` to the standard deviation of C_D d above which a record without drag
 excludes all drag."""
 
-_MIN_STD_RATIO: Final = 1.1
+_MIN_DAMPING_STD_GROWTH: Final = 1.1
 """Ratio of the standard deviation of a damping ratio with drag of unknown size to that without
 drag, above which the drag matters."""
 
-_LIKELY_DRAG_DEVIANCE: Final = 6.6
+_MIN_LIKELY_DRAG_DEVIANCE: Final = 6.6
 """Reduction of the deviance from which drag is fitted although the record could exclude it. It
 happens by chance in one record of a hundred."""
 
 MAX_DRAG_COMPUTATIONS: Final = 8
 """Maximum number of computations of the drag torque for one record."""
 
-_LEAST_DRAG_M: Final = 1e-6
+_MIN_COMPUTED_DRAG_M: Final = 1e-6
 """C_D d that hardly brakes a beam, for which the torque is computed if the estimate is less."""
 
-_CHANGED_DAMPING_STDS: Final = 3.0
+_MIN_CHANGED_DAMPING_STDS: Final = 3.0
 """Change of a damping ratio if drag is fitted, in its standard deviations without drag, from which
 the value without drag is doubtful even if the fit with drag explains the record less well."""
 
@@ -79,22 +79,22 @@ class ModesWithDrag:
         Modes without air.
     law : DragLaw
         Drag coefficient times width, C_D d.
-    std_m : float
+    drag_std_m : float
         Standard deviation of the part of C_D d that does not depend on the speed, in m.
     comparison : Comparison
         Record without the torque of this drag, which the expansion of the torque corrects.
     drag_spectra : ndarray of complex, shape (1, K)
         Derivative of the torque by the first number of the law.
-    converged : bool
+    has_converged : bool
         Whether another computation of the drag torque would hardly change the drag.
     """
 
     modal_fit: ModalFit
     law: DragLaw
-    std_m: float
+    drag_std_m: float
     comparison: Comparison
     drag_spectra: NDArray[np.complex128]
-    converged: bool = False
+    has_converged: bool = False
 
     def fit_with_effect(
         self, candidate_set: CandidateSet, effect_spectrum: NDArray[np.complex128]
@@ -113,7 +113,9 @@ class ModesWithDrag:
 
     def finding(self) -> Finding:
         """Return the finding that the damping ratios are those without air, and less certain."""
-        drag_mm, std_mm = rounded_to_uncertainty((self.law.constant_m, self.std_m), self.std_m, 1e3)
+        drag_mm, std_mm = rounded_to_uncertainty(
+            (self.law.constant_m, self.drag_std_m), self.drag_std_m, 1e3
+        )
         return Finding(
             kind="air drag",
             sentence=(
@@ -141,82 +143,98 @@ def fit_modes_with_drag(
     small drag on a beam with these modes, in N·m per metre of C_D d. The drag torque is computed at
     most `max_computations` times.
     """
-    without_drag = candidate_set.comparison.use_whole_angle()
+    comparison_without_drag = candidate_set.comparison.use_whole_angle()
     whole_angle_fit: ModalFit | None = modal_fit
-    if without_drag is not candidate_set.comparison:
+    if comparison_without_drag is not candidate_set.comparison:
         mode_starts = _mode_starts(modal_fit)
-        whole_angle_fit = modes_with_poles(without_drag, modal_fit.noise, mode_starts)
+        whole_angle_fit = fit_with_given_poles(
+            comparison_without_drag, modal_fit.noise, mode_starts
+        )
     if whole_angle_fit is None or not _drag_matters(whole_angle_fit, drag_spectrum):
         return None
-    current = ModesWithDrag(modal_fit, DragLaw(0.0), 0.0, without_drag, drag_spectrum[None])
-    estimates_m = [0.0]
-    for remaining in reversed(range(max_computations)):
+    current_fit = ModesWithDrag(
+        modal_fit, DragLaw(0.0), 0.0, comparison_without_drag, drag_spectrum[None]
+    )
+    drag_estimates_m = [0.0]
+    for remaining_computations in reversed(range(max_computations)):
         fit_with_drag = fit_modes(
-            current.comparison,
+            current_fit.comparison,
             candidate_set.noise,
-            _mode_starts(current.modal_fit),
-            current.drag_spectra,
+            _mode_starts(current_fit.modal_fit),
+            current_fit.drag_spectra,
         )
-        if fit_with_drag is None or fit_with_drag.visible != modal_fit.visible:
+        if (
+            fit_with_drag is None
+            or fit_with_drag.visible_mode_numbers != modal_fit.visible_mode_numbers
+        ):
             # Drag of any size imitates a mode that hardly shows.
-            return None if len(estimates_m) == 1 else current
-        [change_m], [std_m] = fit_with_drag.effect_sizes, fit_with_drag.effect_stds
-        law = DragLaw(current.law.constant_m + change_m)
-        estimates_m.append(law.constant_m)
-        is_first_order = len(estimates_m) == 2  # which misses that drag limits the amplitude
-        has_converged = _remaining_change_m(estimates_m) < _DRAG_TOLERANCE_STDS * std_m
-        current = replace(
-            current,
+            return None if len(drag_estimates_m) == 1 else current_fit
+        [drag_change_m], [std_m] = fit_with_drag.effect_sizes, fit_with_drag.effect_stds
+        law = DragLaw(current_fit.law.constant_m + drag_change_m)
+        drag_estimates_m.append(law.constant_m)
+        is_first_order_estimate = (
+            len(drag_estimates_m) == 2
+        )  # which misses that drag limits the amplitude
+        has_converged = _remaining_change_m(drag_estimates_m) < _DRAG_TOLERANCE_STDS * std_m
+        current_fit = replace(
+            current_fit,
             modal_fit=fit_with_drag,
             law=law,
-            std_m=std_m,
-            converged=has_converged and not is_first_order,
+            drag_std_m=std_m,
+            has_converged=has_converged and not is_first_order_estimate,
         )
-        if current.converged or not remaining:
+        if current_fit.has_converged or not remaining_computations:
             break
         # Negative drag is an error of the estimate. Its torque is that of hardly any drag, whose
         # derivatives belong to these poles; those of a small drag may be too far off.
-        assumed_law = DragLaw(max(law.constant_m, _LEAST_DRAG_M))
+        assumed_law = DragLaw(max(law.constant_m, _MIN_COMPUTED_DRAG_M))
         try:
-            comparison = without_drag.remove_drag_torque(
-                fit_with_drag.uniform_plant(without_drag.measurement.nominal_plant),
+            comparison = comparison_without_drag.remove_drag_torque(
+                fit_with_drag.uniform_plant(comparison_without_drag.measurement.nominal_plant),
                 assumed_law,
                 fit_with_drag,
             )
         except DragError:
             break  # that of the last fit is not exact
         assert comparison.drag is not None
-        current = replace(
-            current,
+        current_fit = replace(
+            current_fit,
             law=assumed_law,
             comparison=comparison,
             drag_spectra=comparison.drag.law_derivatives[:1],
         )
-    return current
+    return current_fit
 
 
-def _remaining_change_m(estimates_m: Sequence[float]) -> float:
+def _remaining_change_m(drag_estimates_m: Sequence[float]) -> float:
     """Return the change of C_D d in m that another computation of the drag torque would cause.
 
     It is extrapolated from the last changes: each is the same fraction of the one before.
     """
-    changes_m = np.abs(np.diff(estimates_m))[-2:]
-    largest_m = float(changes_m.max())
-    return float(changes_m[-1]) ** 2 / largest_m if largest_m else 0.0
+    drag_changes_m = np.abs(np.diff(drag_estimates_m))[-2:]
+    largest_change_m = float(drag_changes_m.max())
+    return float(drag_changes_m[-1]) ** 2 / largest_change_m if largest_change_m else 0.0
 
 
-def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[int, ...]:
+def mode_numbers_changed_by_drag(modal_fit: ModalFit, fit_with_drag: ModalFit) -> tuple[int, ...]:
     """Return the numbers of the modes whose damping ratio drag changes by more than chance would.
 
     `modal_fit` has the modes of the same record without drag.
     """
-    changed_numbers = []
-    for mode_number in set(modal_fit.visible) & set(with_drag.visible):
+    changed_mode_numbers = []
+    for mode_number in set(modal_fit.visible_mode_numbers) & set(
+        fit_with_drag.visible_mode_numbers
+    ):
         mode_without_drag = modal_fit.mode(mode_number)
-        change = mode_without_drag.damping_ratio - with_drag.mode(mode_number).damping_ratio
-        if abs(change) > _CHANGED_DAMPING_STDS * mode_without_drag.damping_ratio_std:
-            changed_numbers.append(mode_number)
-    return tuple(sorted(changed_numbers))
+        damping_ratio_change = (
+            mode_without_drag.damping_ratio - fit_with_drag.mode(mode_number).damping_ratio
+        )
+        if (
+            abs(damping_ratio_change)
+            > _MIN_CHANGED_DAMPING_STDS * mode_without_drag.damping_ratio_std
+        ):
+            changed_mode_numbers.append(mode_number)
+    return tuple(sorted(changed_mode_numbers))
 
 
 def _mode_starts(modal_fit: ModalFit) -> list[tuple[int, float, float]]:
@@ -232,9 +250,9 @@ def _drag_matters(modal_fit: ModalFit, drag_spectrum: NDArray[np.complex128]) ->
 
     `drag_spectrum`, shape (K,), is that of a small drag.
     """
-    std_ratios = modal_fit.damping_std_ratios(drag_spectrum, _LARGEST_DRAG_M)
-    if std_ratios.max() < _MIN_STD_RATIO:
+    std_growth_factors = modal_fit.damping_std_growth_factors(drag_spectrum, _LARGEST_DRAG_M)
+    if std_growth_factors.max() < _MIN_DAMPING_STD_GROWTH:
         return False
-    is_excludable = modal_fit.effect_std(drag_spectrum) < _SMALLEST_DRAG_M / _MIN_DRAG_STDS
+    is_drag_excludable = modal_fit.effect_std(drag_spectrum) < _SMALLEST_DRAG_M / _MIN_DRAG_STDS
     [cost_reduction] = modal_fit.cost_reduction_by_spectrum(drag_spectrum[None])
-    return not is_excludable or bool(cost_reduction > _LIKELY_DRAG_DEVIANCE)
+    return not is_drag_excludable or bool(cost_reduction > _MIN_LIKELY_DRAG_DEVIANCE)

@@ -56,21 +56,21 @@ FORCE_KINDS: Final[tuple[ForceKind, ...]] = (
 _DEFLECTION_EXPONENTS: Final = {"cubic stiffness": 3, "quadratic stiffness": 2}
 """Exponent of the deflection in each force that depends on it."""
 
-_OVERSAMPLING: Final = 3
+_FORCE_OVERSAMPLING: Final = 3
 """Factor by which the sampling rate is raised to compute a nonlinear force. The band ends at 0.4 of
 the rate, so harmonics up to three times its end do not alias into the band."""
 
-_PADDING_RATIO: Final = 1.5
+_TRANSFORM_PADDING_RATIO: Final = 1.5
 """Length of the transforms over that of the record."""
 
-_DECAY_EXPONENT: Final = 9.0
+_TRANSFORM_DECAY_EXPONENT: Final = 9.0
 """Decay exponent of the `CausalTransform`. It is large because repeated substitution accumulates
 what wraps round from the end of a transform to its beginning."""
 
-_MAX_SUBSTITUTIONS: Final = 12
+_MAX_FORCE_ITERATIONS: Final = 12
 """Maximum number of substitutions that compute the motion of a mode with its nonlinear force."""
 
-_FORCE_TOLERANCE: Final = 1e-3
+_RELATIVE_FORCE_TOLERANCE: Final = 1e-3
 """Relative change of a nonlinear force below which the repeated substitution has converged."""
 
 
@@ -99,7 +99,10 @@ class NonlinearForceSpectra:
         self._comparison, self._plant = comparison, plant
         self._samples = comparison.angle_rad.size
         self._transform = CausalTransform.for_record(
-            self._samples, comparison.decimation.rate_hz, _PADDING_RATIO, _DECAY_EXPONENT
+            self._samples,
+            comparison.decimation.rate_hz,
+            _TRANSFORM_PADDING_RATIO,
+            _TRANSFORM_DECAY_EXPONENT,
         )
         self._s = self._transform.s
         damping, density_over_stiffness = plant.damping, plant.beam.density_over_stiffness
@@ -127,7 +130,7 @@ class NonlinearForceSpectra:
         if force_size:
             motion_per_force = -force_size * k / dynamic_stiffness
             with np.errstate(over="ignore", invalid="ignore"):
-                for _ in range(_MAX_SUBSTITUTIONS):
+                for _ in range(_MAX_FORCE_ITERATIONS):
                     new_force_transform = self._force_transform(
                         term.kind, linear_motion + motion_per_force * force_transform, force_scale
                     )
@@ -138,7 +141,7 @@ class NonlinearForceSpectra:
                     force_transform = new_force_transform
                     if not np.isfinite(force_norm):
                         return np.full(self._comparison.frequency_hz.size, np.nan + 0j)
-                    if force_change < _FORCE_TOLERANCE * force_norm:
+                    if force_change < _RELATIVE_FORCE_TOLERANCE * force_norm:
                         break
         plant_beam = self._plant.beam
         torque_scale = (
@@ -178,8 +181,8 @@ class NonlinearForceSpectra:
         """
         largest_deflection = np.abs(self._oversampled_values(linear_motion_transform)).max()
         if force_kind == "quadratic drag":
-            speed = self._oversampled_values(linear_motion_transform * self._s)
-            return float(2 * largest_deflection / np.abs(speed).max() ** 2)
+            modal_speed = self._oversampled_values(linear_motion_transform * self._s)
+            return float(2 * largest_deflection / np.abs(modal_speed).max() ** 2)
         return float(1 / largest_deflection ** (_DEFLECTION_EXPONENTS[force_kind] - 1))
 
     def _force_transform(
@@ -193,17 +196,17 @@ class NonlinearForceSpectra:
         `motion_transform` is the transform of the motion of the mode, which determines the force.
         """
         if force_kind == "quadratic drag":
-            speed = self._oversampled_values(motion_transform * self._s)
-            n = speed * np.abs(speed)
+            modal_speed = self._oversampled_values(motion_transform * self._s)
+            force_values = modal_speed * np.abs(modal_speed)
         else:
             deflection = self._oversampled_values(motion_transform)
-            n = deflection ** _DEFLECTION_EXPONENTS[force_kind]
-        return force_scale * self._transform.forward(n, oversampling=_OVERSAMPLING)
+            force_values = deflection ** _DEFLECTION_EXPONENTS[force_kind]
+        return force_scale * self._transform.forward(force_values, oversampling=_FORCE_OVERSAMPLING)
 
     def _oversampled_values(self, motion_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return the inverse of a mode's Laplace transform as an oversampled time series."""
         return self._transform.inverse(
-            motion_transform, _OVERSAMPLING * self._samples, oversampling=_OVERSAMPLING
+            motion_transform, _FORCE_OVERSAMPLING * self._samples, oversampling=_FORCE_OVERSAMPLING
         )
 
 
@@ -230,7 +233,7 @@ _GIVE_UP_DEVIANCE: Final = 2000.0
 """Deviance, relative to that of the best candidate, above which a force is not fitted: the
 first-order prediction is then too far off for repeated substitution to make up for it."""
 
-_MIN_EXPLAINED_FRACTION: Final = 0.5
+_MIN_EXPLAINED_EXCESS_FRACTION: Final = 0.5
 """Minimum fraction of the cost beyond noise that nonlinear forces must explain. Otherwise the
 residual has another cause."""
 
@@ -256,12 +259,12 @@ class NonlinearForce:
 
 
 def add_nonlinear_forces(
-    candidate_set: CandidateSet, modes: tuple[int, ...]
+    candidate_set: CandidateSet, mode_numbers: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Return the candidate set refitted with significant nonlinear forces, and the forces.
 
-    The forces are added one by one to the visible `modes`. Return the given candidates and no
-    forces if none is significant.
+    The forces are added one by one to the visible `mode_numbers`. Return the given candidates and
+    no forces if none is significant.
 
     A mode whose stiffness rises resembles a mode of another frequency, or a fractional order. If
     the best candidate has a fractional order, the search also starts from candidates without one.
@@ -274,13 +277,13 @@ def add_nonlinear_forces(
         _deviance_reduction(
             best_candidate,
             best_refit.cost,
-            _best_first_order_force(candidate_set, best_refit, modes, [])[1],
+            _best_first_order_force(candidate_set, best_refit, mode_numbers, [])[1],
         )
         < _MIN_PREDICTED_DEVIANCE_REDUCTION
     ):
         return candidate_set, ()
     for start_candidate in _start_candidates(candidate_set):
-        with_forces, forces = _add_forces(candidate_set, start_candidate, modes)
+        with_forces, forces = _add_forces(candidate_set, start_candidate, mode_numbers)
         if (
             forces
             and with_forces.bic < candidate_set.bic - BIC_DECISIVE
@@ -306,19 +309,19 @@ def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
 
 
 def _add_forces(
-    candidate_set: CandidateSet, start_candidate: Candidate, modes: tuple[int, ...]
+    candidate_set: CandidateSet, start_candidate: Candidate, mode_numbers: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Return the candidate set refitted with the nonlinear forces of one candidate, and the forces.
 
     Significant forces are added to that candidate one by one.
     """
     found_terms: list[NonlinearTerm] = []
-    force_sizes = std = np.zeros(0)
+    force_sizes = force_stds = np.zeros(0)
     best_candidate = candidate_set.best
     refit = candidate_set.refit(start_candidate)
     while len(found_terms) < _MAX_FORCES:
         best_term, cost_with_term = _best_first_order_force(
-            candidate_set, refit, modes, found_terms
+            candidate_set, refit, mode_numbers, found_terms
         )
         deviance_above_best = _deviance_reduction(
             best_candidate, cost_with_term, best_candidate.fit.cost
@@ -340,14 +343,14 @@ def _add_forces(
         ):
             break
         found_terms.append(best_term)
-        refit, force_sizes, std = fit_with_term
+        refit, force_sizes, force_stds = fit_with_term
     if not found_terms:
         return candidate_set, ()
-    with_forces = candidate_set.refit_with_effect_spectra(
+    candidate_set_with_forces = candidate_set.refit_with_effect_spectra(
         refit.effect_spectra, refit.residual_noise()
     )
-    forces = zip(found_terms, force_sizes.tolist(), std.tolist(), strict=True)
-    return with_forces, tuple(
+    forces = zip(found_terms, force_sizes.tolist(), force_stds.tolist(), strict=True)
+    return candidate_set_with_forces, tuple(
         NonlinearForce(best_term, force_size, s) for best_term, force_size, s in forces
     )
 
@@ -360,7 +363,7 @@ def _deviance_reduction(candidate: Candidate, cost_before: float, cost_after: fl
 def _best_first_order_force(
     candidate_set: CandidateSet,
     refit: Refit,
-    modes: tuple[int, ...],
+    mode_numbers: tuple[int, ...],
     excluded_terms: list[NonlinearTerm],
 ) -> tuple[NonlinearTerm | None, float]:
     """Return the nonlinear force that reduces the cost most, and the cost with it.
@@ -378,7 +381,7 @@ def _best_first_order_force(
     tested_terms = [
         NonlinearTerm(force_kind, mode_number)
         for force_kind in tested_kinds
-        for mode_number in modes
+        for mode_number in mode_numbers
     ]
     tested_terms = [force_term for force_term in tested_terms if force_term not in excluded_terms]
     if not tested_terms:
@@ -403,7 +406,7 @@ def _fit_with_forces(
     The torque spectra of the forces are updated with the sizes. Return the fit, the sizes and their
     standard deviations, or None if a size is so large that its torque cannot be computed.
     """
-    std = np.zeros(force_sizes.size)
+    force_stds = np.zeros(force_sizes.size)
     for _ in range(_MAX_SIZE_ITERATIONS):
         force_spectra = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
         spectra = [
@@ -421,26 +424,33 @@ def _fit_with_forces(
             torque_spectra,
         )
         last_force_sizes = force_sizes
-        force_sizes, std = (
+        force_sizes, force_stds = (
             force_values[len(candidate_set.effect_spectra) :] for force_values in refit.amplitudes()
         )
         if np.all(
             np.abs(force_sizes - last_force_sizes)
-            < np.maximum(0.3 * std, _RELATIVE_SIZE_TOLERANCE * np.abs(force_sizes))
+            < np.maximum(0.3 * force_stds, _RELATIVE_SIZE_TOLERANCE * np.abs(force_sizes))
         ):
             break
-    return refit, force_sizes, std
+    return refit, force_sizes, force_stds
 
 
-def _forces_explain_residual(linear_set: CandidateSet, set_with_forces: CandidateSet) -> bool:
+def _forces_explain_residual(
+    linear_candidate_set: CandidateSet, candidate_set_with_forces: CandidateSet
+) -> bool:
     """Return whether nonlinear forces explain half of the residual beyond noise.
 
     Return True also if they leave only noise.
     """
-    residual_power = np.abs(linear_set.best.fit.residual) ** 2
-    excess_without_forces = linear_set.best.fit.cost - linear_set.best.fit.degrees_of_freedom
-    largest_by_chance = SIGNIFICANT_STD * math.sqrt(2 * residual_power.size * 2)
-    excess_with_forces = set_with_forces.best.fit.cost - set_with_forces.best.fit.degrees_of_freedom
-    return excess_with_forces < max(
-        _MIN_EXPLAINED_FRACTION * excess_without_forces, largest_by_chance
+    residual_power = np.abs(linear_candidate_set.best.fit.residual) ** 2
+    excess_cost_without_forces = (
+        linear_candidate_set.best.fit.cost - linear_candidate_set.best.fit.degrees_of_freedom
+    )
+    largest_excess_by_chance = SIGNIFICANT_STD * math.sqrt(2 * residual_power.size * 2)
+    excess_cost_with_forces = (
+        candidate_set_with_forces.best.fit.cost
+        - candidate_set_with_forces.best.fit.degrees_of_freedom
+    )
+    return excess_cost_with_forces < max(
+        _MIN_EXPLAINED_EXCESS_FRACTION * excess_cost_without_forces, largest_excess_by_chance
     )

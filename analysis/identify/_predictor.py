@@ -34,14 +34,14 @@ def eigenvalues(mode_count: int) -> NDArray[np.float64]:
 
     The array is cached and read-only.
     """
-    z = clamped_free_eigenvalues(mode_count)
-    z.flags.writeable = False
-    return z
+    eigenvalues_kl = clamped_free_eigenvalues(mode_count)
+    eigenvalues_kl.flags.writeable = False
+    return eigenvalues_kl
 
 
 # Prediction
 
-_VALUES_AT_ONCE: Final = 1 << 17
+_VALUES_PER_BLOCK: Final = 1 << 17
 """Number of values of time series that are transformed at once. A transform of two rows takes
 little longer than that of one, and what exceeds the processor's cache takes longer again. The rows
 of long records are transformed one by one, since their transforms take much memory."""
@@ -138,9 +138,9 @@ class TorquePredictor:
         row_count : int
             Number of time series.
         """
-        block_rows = max(_VALUES_AT_ONCE // self._transform.length, 1)
-        for first_row in range(0, row_count, block_rows):
-            yield slice(first_row, min(first_row + block_rows, row_count))
+        rows_per_block = max(_VALUES_PER_BLOCK // self._transform.length, 1)
+        for first_row in range(0, row_count, rows_per_block):
+            yield slice(first_row, min(first_row + rows_per_block, row_count))
 
     def _torque_spectra(
         self, plant: Plant | ModalModel, gradient_parameters: Sequence[str]

@@ -75,10 +75,10 @@ class ProjectedResidual:
         )
 
 
-_MAX_TORQUE_FILLINGS: Final = 8
+_MAX_TORQUE_FILLING_ROUNDS: Final = 8
 """Maximum number of times that a descent is repeated with unknown torques filled again."""
 
-_UNKNOWNS_TOLERANCE: Final = 1e-6
+_CONVERGED_UNKNOWNS_CHANGE: Final = 1e-6
 """Change of the unknowns below which the filling of unknown torques has converged."""
 
 
@@ -106,34 +106,36 @@ class Objective:
         unknowns: Unknowns,
         effect_spectra: NDArray[np.complex128] | None = None,
     ) -> None:
-        no_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
+        no_effect_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
         self.comparison = comparison
         self.unknowns = unknowns
-        self.effect_spectra = no_spectra if effect_spectra is None else effect_spectra
+        self.effect_spectra = no_effect_spectra if effect_spectra is None else effect_spectra
         self._recent: RecentValues[Linearisation] = (
             comparison.shared_result_cache if comparison.is_long else RecentValues()
         )
 
-    def linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Return the torque residual and its derivatives for the unknowns `x`.
+    def linearise(self, vector_of_unknowns: NDArray[np.float64]) -> Linearisation:
+        """Return the torque residual and its derivatives for the unknowns `vector_of_unknowns`.
 
         The results at the last points are cached.
         """
-        owner = self if self.comparison.is_long else None
-        return self._recent.value_at(x, self._linearise, owner)
+        cache_owner = self if self.comparison.is_long else None
+        return self._recent.value_at(vector_of_unknowns, self._linearise, cache_owner)
 
-    def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Return torque residual and derivatives for the unknowns `x`, without the cache."""
+    def _linearise(self, vector_of_unknowns: NDArray[np.float64]) -> Linearisation:
+        """Return torque residual and derivatives for given unknowns, without the cache."""
         comparison, unknowns = self.comparison, self.unknowns
         gradient_names = unknowns.gradient_names
-        plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
-        spectra = np.empty((1 + len(gradient_names), comparison.frequency_hz.size), np.complex128)
+        plant, parameters_by_unknowns = unknowns.plant_and_gradient(vector_of_unknowns)
+        predicted_spectra = np.empty(
+            (1 + len(gradient_names), comparison.frequency_hz.size), np.complex128
+        )
         for rows, torque_nm in comparison.torque_predictor.torque_blocks(plant, gradient_names):
             if rows.start == 0:
                 torque_nm[0] -= comparison.torque_nm[comparison.retained_samples]
-            spectra[rows] = comparison.spectrum(torque_nm)
+            predicted_spectra[rows] = comparison.spectrum(torque_nm)
         # A copy, so that the derivatives are not stored with the residual.
-        residual, derivatives = spectra[0].copy(), spectra[1:]
+        residual, derivatives = predicted_spectra[0].copy(), predicted_spectra[1:]
         poles = tuple(
             Pole(
                 plant_pole.mode, plant_pole.at_rad_s, plant_pole.derivative @ parameters_by_unknowns
@@ -149,7 +151,7 @@ class Objective:
             jacobian += drag_derivatives
         return Linearisation(residual=residual, jacobian=jacobian, poles=poles)
 
-    def unknown_torques(self, linearisation: Linearisation) -> NDArray[np.complex128]:
+    def unknown_torque_spectra(self, linearisation: Linearisation) -> NDArray[np.complex128]:
         """Return the spectra of torques with unknown amplitude at one point, shape (m, K).
 
         They are free decays, other disturbances and effects.
@@ -157,7 +159,7 @@ class Objective:
         return self.comparison.nuisance_spectra(linearisation.poles, self.effect_spectra)
 
     def project(
-        self, linearisation: Linearisation, weight: NDArray[np.float64] | float
+        self, linearisation: Linearisation, noise_weight: NDArray[np.float64] | float
     ) -> ProjectedResidual:
         """Return whitened residual and derivatives without the torques of unknown amplitude.
 
@@ -170,18 +172,21 @@ class Objective:
         ----------
         linearisation : Linearisation
             Residual and derivatives at one point.
-        weight : ndarray, shape (K,), or float
+        noise_weight : ndarray, shape (K,), or float
             Weight of `NoiseSpectrum`; with 1 nothing is whitened.
         """
-        residual, jacobian = linearisation.residual * weight, linearisation.jacobian * weight
-        unit_columns = _as_real_rows(self.unknown_torques(linearisation) * weight)
+        residual, jacobian = (
+            linearisation.residual * noise_weight,
+            linearisation.jacobian * noise_weight,
+        )
+        unit_columns = _as_real_rows(self.unknown_torque_spectra(linearisation) * noise_weight)
         column_lengths = np.sqrt(np.einsum("ij,ij->i", unit_columns, unit_columns))
         column_lengths[column_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
         unit_columns /= column_lengths[:, None]
         column_gram = unit_columns @ unit_columns.T
         inverse_gram = np.linalg.inv(column_gram + 1e-12 * np.eye(column_lengths.size))
         amplitudes = -inverse_gram @ (unit_columns @ _as_real_rows(residual))
-        jacobian += weight * self.comparison.decay_gradient(
+        jacobian += noise_weight * self.comparison.decay_gradient(
             linearisation.poles, amplitudes / column_lengths
         )
         real_jacobian = _as_real_rows(jacobian)
@@ -194,28 +199,28 @@ class Objective:
         )
 
     def normal_equations(
-        self, x: NDArray[np.float64], weight: NDArray[np.float64]
+        self, vector_of_unknowns: NDArray[np.float64], noise_weight: NDArray[np.float64]
     ) -> NormalEquations:
-        """Return the cost for the unknowns `x`, with gradient and Hessian of a Gauss-Newton step.
+        """Return the cost for given unknowns, with gradient and Hessian of a Gauss-Newton step.
 
         Parameters
         ----------
-        x : ndarray, shape (k,)
+        vector_of_unknowns : ndarray, shape (k,)
             Unknowns.
-        weight : ndarray, shape (K,)
+        noise_weight : ndarray, shape (K,)
             Inverse standard deviation of the noise in each bin.
         """
-        return self.project(self.linearise(x), weight).normal_equations()
+        return self.project(self.linearise(vector_of_unknowns), noise_weight).normal_equations()
 
-    def minimum(
+    def find_minimum(
         self,
         start_unknowns: NDArray[np.float64],
-        weight: NDArray[np.float64],
+        noise_weight: NDArray[np.float64],
         region: Region,
         *,
         relative_tolerance: float,
         max_evaluations: int = 200,
-        hopeless: tuple[int, float] | None = None,
+        give_up_condition: tuple[int, float] | None = None,
     ) -> tuple[Objective, Minimum]:
         """Return the minimum of the cost reached by descents from `start_unknowns`.
 
@@ -225,7 +230,7 @@ class Objective:
         ----------
         start_unknowns : ndarray, shape (k,)
             Unknowns at which the descent starts.
-        weight : ndarray, shape (K,)
+        noise_weight : ndarray, shape (K,)
             Weight of `NoiseSpectrum`.
         region, relative_tolerance, max_evaluations, hopeless
             Arguments of `descend`.
@@ -234,34 +239,39 @@ class Objective:
         -------
         objective : Objective
             Objective with the unknown torques filled for the last time; `self` if all are known.
-        minimum : Minimum
+        find_minimum : Minimum
             Minimum of that objective.
         """
-        x = start_unknowns
-        for _ in range(_MAX_TORQUE_FILLINGS):
-            objective = self._fill_unknown_torque(x)
+        vector_of_unknowns = start_unknowns
+        for _ in range(_MAX_TORQUE_FILLING_ROUNDS):
+            objective = self._fill_unknown_torque(vector_of_unknowns)
             minimum = descend(
-                partial(objective.normal_equations, weight=weight),
-                x,
+                partial(objective.normal_equations, noise_weight=noise_weight),
+                vector_of_unknowns,
                 region,
                 relative_tolerance=relative_tolerance,
                 max_evaluations=max_evaluations,
-                early_stop_limits=hopeless,
+                early_stop_limits=give_up_condition,
             )
-            has_converged = objective is self or np.abs(minimum.x - x).max() < _UNKNOWNS_TOLERANCE
-            x = minimum.x
+            has_converged = (
+                objective is self
+                or np.abs(minimum.x - vector_of_unknowns).max() < _CONVERGED_UNKNOWNS_CHANGE
+            )
+            vector_of_unknowns = minimum.x
             # A descent that did not converge does not converge with new fills either.
-            is_given_up = hopeless is not None and minimum.equations.cost > hopeless[1]
+            is_given_up = (
+                give_up_condition is not None and minimum.equations.cost > give_up_condition[1]
+            )
             if has_converged or is_given_up or minimum.evaluations >= max_evaluations:
                 break
         return objective, minimum
 
-    def _fill_unknown_torque(self, x: NDArray[np.float64]) -> Objective:
-        """Return the objective with unmeasured torques filled by the prediction at `x`.
+    def _fill_unknown_torque(self, vector_of_unknowns: NDArray[np.float64]) -> Objective:
+        """Return the objective with unmeasured torques filled by the prediction for given unknowns.
 
         Return `self` if all torques were measured.
         """
-        comparison = self.comparison.fill_unknown_torque(self.unknowns.plant(x))
+        comparison = self.comparison.fill_unknown_torque(self.unknowns.plant(vector_of_unknowns))
         if comparison is self.comparison:
             return self
         return Objective(comparison, self.unknowns, self.effect_spectra)

@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.identify._drag import refit_with_air_drag, small_drag_spectrum
 from analysis.identify._modal_fit import fit_modes
-from analysis.identify._modes_with_drag import fit_modes_with_drag, modes_that_drag_changes
+from analysis.identify._modes_with_drag import fit_modes_with_drag, mode_numbers_changed_by_drag
 from analysis.identify._nonlinear import add_nonlinear_forces
 from analysis.identify._small_effects import LARGE_DEVIANCE_REDUCTION, small_effect
 from analysis.identify._step_in_time import best_stiffness_step
@@ -242,7 +242,7 @@ def fit_drag_with_modes(
         _small_drag(candidate_set, modal_fit),
         max_computations=max_computations,
     )
-    return _accepted_drag(modal_fit, modes_with_drag, lambda with_drag: with_drag.explained)
+    return _accepted_drag(modal_fit, modes_with_drag, lambda with_drag: with_drag.residual_is_noise)
 
 
 def _accepted_drag(
@@ -256,9 +256,9 @@ def _accepted_drag(
     """
     if modes_with_drag is None:
         return None, ()
-    if modes_with_drag.converged and explains_record(modes_with_drag.modal_fit):
+    if modes_with_drag.has_converged and explains_record(modes_with_drag.modal_fit):
         return modes_with_drag, ()
-    return None, modes_that_drag_changes(modal_fit, modes_with_drag.modal_fit)
+    return None, mode_numbers_changed_by_drag(modal_fit, modes_with_drag.modal_fit)
 
 
 def fit_modal_model(
@@ -319,7 +319,9 @@ def _explains_record(
     if modal_fit is None:
         return False
     residual_tests = test_residual(candidate_set, modal_fit, band_hz)
-    return modal_fit.explained and not any(each.present for each in residual_tests.harmonics)
+    return modal_fit.residual_is_noise and not any(
+        each.present for each in residual_tests.harmonics
+    )
 
 
 def _small_drag(candidate_set: CandidateSet, modal_fit: ModalFit) -> NDArray[np.complex128]:

@@ -98,7 +98,7 @@ class Refit:
             descent_steps,
             relative_tolerance=relative_tolerance,
             max_evaluations=max_evaluations,
-            hopeless=hopeless,
+            give_up_condition=hopeless,
         )
         return cls(objective, minimum.x, minimum.equations, noise)
 
@@ -108,7 +108,7 @@ class Refit:
         The evaluation made at this point counts as the first one. It is repeated only if torques of
         impacts are unknown.
         """
-        objective, minimum = self.objective.minimum(
+        objective, minimum = self.objective.find_minimum(
             self.x,
             self.noise.weight,
             StepRule.for_unknowns(self.objective.unknowns, VANISHING_LOSS),
@@ -171,7 +171,7 @@ class Refit:
         """Return the sizes of the added torque spectra, shape (c,), and the covariance, (c, c)."""
         linearisation = self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, self.noise.weight)
-        whitened_spectra = self.objective.unknown_torques(linearisation) * self.noise.weight
+        whitened_spectra = self.objective.unknown_torque_spectra(linearisation) * self.noise.weight
         # The Jacobian before the projection is needed: after it the spectra are orthogonal to the
         # Jacobian, so their amplitudes would seem independent of the unknowns.
         derivatives = np.concatenate([linearisation.jacobian * self.noise.weight, whitened_spectra])
@@ -201,7 +201,7 @@ class Refit:
         """
         noise_weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, noise_weight)
-        explaining_spectra = self.objective.unknown_torques(linearisation) * noise_weight
+        explaining_spectra = self.objective.unknown_torque_spectra(linearisation) * noise_weight
         if beam_free:
             explaining_spectra = np.concatenate([projected_objective.jacobian, explaining_spectra])
         return unexplained_part(

@@ -295,8 +295,12 @@ class Descent:
         the cost above which `descend` gives up.
         """
         descent_steps = StepRule.for_unknowns(self.objective.unknowns)
-        objective, minimum = self.objective.minimum(
-            self.x, noise.weight, descent_steps, relative_tolerance=tolerance, hopeless=hopeless
+        objective, minimum = self.objective.find_minimum(
+            self.x,
+            noise.weight,
+            descent_steps,
+            relative_tolerance=tolerance,
+            give_up_condition=hopeless,
         )
         return Descent(objective, minimum.x, (noise, minimum.cost))
 
@@ -329,7 +333,7 @@ class Descent:
         decay_count = count_decay_spectra(linearisation.poles) * (
             1 + len(comparison.later_decay_spectra)
         )
-        decay_spectra = self.objective.unknown_torques(linearisation)[:decay_count]
+        decay_spectra = self.objective.unknown_torque_spectra(linearisation)[:decay_count]
         decaying_nm = comparison.to_time_series(torque_amplitudes[:decay_count] @ decay_spectra)
         return find_hum_near_modes(comparison, self.plant, linearisation.poles, noise, decaying_nm)
 

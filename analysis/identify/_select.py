@@ -199,7 +199,7 @@ class _Assessment(Generic[_ResultT]):
     check: ModelCheck
 
     @property
-    def explained(self) -> bool:
+    def residual_is_noise(self) -> bool:
         """Whether the residual is noise only."""
         return self.check.residual_tests.is_noise
 
@@ -214,7 +214,7 @@ def _assess_with_impacts(
     """
     assessment = assess_measurement(measurement)
     for _ in range(MAX_IMPACTS):
-        if assessment.explained or not _KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(
+        if assessment.residual_is_noise or not _KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(
             assessment.check.finding_kinds
         ):
             break
@@ -227,9 +227,9 @@ def _assess_with_impacts(
             impact_assessment = assess_measurement(
                 add_known_impact(candidate_set.comparison.measurement, impact)
             )
-            if impact_assessment.explained or impact.is_evident:
+            if impact_assessment.residual_is_noise or impact.is_evident:
                 better_assessment = impact_assessment
-            if impact_assessment.explained:
+            if impact_assessment.residual_is_noise:
                 break
         if better_assessment is None:
             break
@@ -259,7 +259,7 @@ def _select_with_known_impacts(
             impact_assessment = _select_with_known_impacts(
                 add_known_impact(measurement, impact), fixed, band_hz, None
             )
-            if impact_assessment.explained:
+            if impact_assessment.residual_is_noise:
                 return impact_assessment
     model = add_further_effects(model, band_hz)
     modal_fit = model.modal_fit
@@ -276,7 +276,7 @@ def _select_with_known_impacts(
         candidate_set, determined_orders, compute=should_compute_profiles
     )
     leading_candidates = candidate_set.with_leading_candidate(candidate_set.freest)
-    check = ModelCheck.run(
+    check = ModelCheck.of_candidates(
         leading_candidates, modal_fit, band_hz, model.nonlinear_forces, model.temporal_changes
     )
     alpha_verdict, lambda_verdict = (
@@ -285,14 +285,17 @@ def _select_with_known_impacts(
     )
     order_verdicts = alpha_verdict, lambda_verdict
     reported_headline = headline(
-        candidate_set, order_verdicts, visible_numbers, unexplained_reason=check.model_reason
+        candidate_set,
+        order_verdicts,
+        visible_numbers,
+        unexplained_reason=check.model_rejection_reason,
     )
     if check.doubt_reason is not None:
         reported_headline = reported_headline.with_flag_on_all(check.doubt_reason)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
     reported_headline = flag_modes_changed_by_drag(reported_headline, model.modes_changed_by_drag)
     effect_findings = model.findings
-    if uniform_beam_refused and check.model_reason is None:
+    if uniform_beam_refused and check.model_rejection_reason is None:
         assert modal_fit is not None
         assert beam_test is not None
         causes, cause_findings = _explain_deviations(
@@ -351,7 +354,7 @@ def _select_with_known_impacts(
             parameters={
                 k: q.value for k, q in reported_headline.parameters.items() if q.flag is None
             },
-            adequate=check.model_reason is None,
+            adequate=check.model_rejection_reason is None,
             alpha=alpha_verdict,
             lambda_=lambda_verdict,
             visible_modes=visible_numbers,
@@ -387,7 +390,7 @@ def _explain_deviations(
 
     Both are empty with only two modes, which leave no degree of freedom for a test of causes.
     """
-    if len(modal_fit.visible) <= MODES_WITHOUT_REDUNDANCY:
+    if len(modal_fit.visible_mode_numbers) <= MODES_WITHOUT_REDUNDANCY:
         return (), ()
     causes = explanations(beam_test)
     stiffness_step = (
@@ -490,13 +493,13 @@ def _fit_freest_with_known_impacts(
     if modes_with_drag is not None:
         modal_fit = modes_with_drag.modal_fit
     visible_numbers = visible_mode_numbers(candidate_set, modal_fit)
-    check = ModelCheck.run(candidate_set, modal_fit, band_hz)
+    check = ModelCheck.of_candidates(candidate_set, modal_fit, band_hz)
     reported_headline = headline_of_fit(
         candidate_set.best.name,
         candidate_set.best.fit,
         visible_numbers,
         {} if misread_findings else _unidentifiable_orders(candidate_set, visible_numbers),
-        unexplained_reason=check.model_reason,
+        unexplained_reason=check.model_rejection_reason,
         fit_with_both_dampings=None
         if misread_findings
         else candidate_set.fit_with_both_dampings(candidate_set.best),
@@ -507,8 +510,8 @@ def _fit_freest_with_known_impacts(
     all_findings = check.reported_findings(
         reported_headline, () if modes_with_drag is None else (modes_with_drag.finding(),)
     )
-    if check.clipped_reason is not None:
-        reported_headline = reported_headline.with_flag_on_all(check.clipped_reason)
+    if check.clipped_torque_reason is not None:
+        reported_headline = reported_headline.with_flag_on_all(check.clipped_torque_reason)
     other_fits = (
         candidate.fit
         for candidate in candidate_set.candidates

@@ -128,7 +128,7 @@ def _possible_effects(
 ) -> Iterator[tuple[FindingKind, str, NDArray[np.complex128]]]:
     """Yield kind, description and torque spectrum, (K,), of small effects other than air drag."""
     force_spectra = NonlinearForceSpectra(comparison, plant)
-    for mode_number in modal_fit.visible:
+    for mode_number in modal_fit.visible_mode_numbers:
         yield (
             "nonlinear stiffness",
             f"A stiffness of mode {mode_number} that depends on the deflection",

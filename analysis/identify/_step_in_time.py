@@ -89,7 +89,7 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
             [step_torque.spectrum(int(sample_index)) for sample_index in sample_indices]
         )
         whitened_spectra = np.ascontiguousarray(step_spectra * fit.noise.weight).view(np.float64)
-        whitened_spectra = fit.outside_span(whitened_spectra)
+        whitened_spectra = fit.part_outside_span(whitened_spectra)
         spectrum_squares = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
         spectrum_squares[spectrum_squares == 0] = np.inf
         correlation = -(whitened_spectra @ real_residual)  # the residual is model less measurement
@@ -123,7 +123,7 @@ class _StiffnessStepTorque:
         angle_transform = self._transform.forward(comparison.angle_rad)
         mode_vibrations, torque_per_force = [], []
         for mode_index, pole, residue in zip(
-            fit.numbers, fit.model.poles_rad_s, fit.model.residues, strict=True
+            fit.mode_numbers, fit.model.poles_rad_s, fit.model.residues, strict=True
         ):
             if mode_index:
                 # The mode adds inertia s⁴ / (s² + 2 xi omega s + omega²) to G, without constants.

@@ -152,7 +152,7 @@ def fit_structure(
             if len(starts) > _MAX_DESCENTS:
                 starts.sort(key=lambda x: objective.normal_equations(x, noise.weight).cost)
             descents = [
-                objective.minimum(
+                objective.find_minimum(
                     start,
                     noise.weight,
                     region,
@@ -162,7 +162,7 @@ def fit_structure(
                 for start in starts[:_MAX_DESCENTS]
             ]
             objective, rough_minimum = min(descents, key=lambda each: each[1].cost)
-            objective, minimum = objective.minimum(
+            objective, minimum = objective.find_minimum(
                 rough_minimum.x, noise.weight, region, relative_tolerance=_COST_TOLERANCE
             )
             x = minimum.x

@@ -108,10 +108,10 @@ def uniform_beam_test(
         Angle in degrees between the beam at rest and the horizontal, as the file states it;
         positive if the tip is lower than the root.
     """
-    mode_numbers = fit.visible
-    constant_rows = fit.rows(mode_numbers)
+    mode_numbers = fit.visible_mode_numbers
+    constant_rows = fit.constant_indices(mode_numbers)
     measured_constants, std = (
-        fit.constants[constant_rows],
+        fit.mode_constants[constant_rows],
         np.sqrt(np.diag(fit.covariance)[constant_rows]),
     )
     degrees_of_freedom = len(constant_rows) - len(PARAMETERS)
@@ -139,7 +139,7 @@ def uniform_beam_test(
         p_value=p_value,
         modes=mode_numbers,
         measured=measured_constants,
-        predicted=problem.constants(best_minimum.x),
+        predicted=problem.constants_with_covariance(best_minimum.x),
         std=std,
         problem=problem,
         unknowns=best_minimum.x,

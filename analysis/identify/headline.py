@@ -220,7 +220,7 @@ class Headline(Estimates):
     ----------
     fit : RecordFit
         Fit of the freest structure that the record supports.
-    explained : bool
+    is_explained : bool
         Whether the residual of this fit is noise only. If not, every number carries a flag.
     with_both : RecordFit
         Fit with internal and external damping, which provides the modes.
@@ -229,7 +229,7 @@ class Headline(Estimates):
     """
 
     fit: RecordFit
-    explained: bool
+    is_explained: bool
     with_both: RecordFit
     modal: ModalFit | None = field(default=None, kw_only=True)
 
@@ -418,7 +418,7 @@ def headline_of_fit(
         structures=((name, "selected"),),
         simpler=None,
         drag_speed_m_s=None,
-        explained=unexplained_reason is None,
+        is_explained=unexplained_reason is None,
     )
 
 

@@ -222,13 +222,13 @@ def _reported_modes(
 
     With `from_beam`, frequency and damping ratio of visible modes are also those of the beam.
     """
-    visible = modal.visible
+    visible = modal.visible_mode_numbers
     modes_by_number: dict[int, ReportedMode] = {
         mode_estimate.number: mode_estimate for mode_estimate in estimates.modes
     }
     for mode_number in visible:
         modal_mode = modal.mode(mode_number)
-        inertia_kg_m2, relative_std = modal.inertia(mode_number)
+        inertia_kg_m2, relative_std = modal.effective_inertia(mode_number)
         mode_estimate = ReportedMode(
             mode_number,
             symmetric_value(

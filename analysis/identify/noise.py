@@ -120,8 +120,8 @@ def estimate_noise(
     residual: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
     sample_count: int,
-    known_fraction: float = 1.0,
-    near_mode: NDArray[np.bool_] | None = None,
+    known_torque_fraction: float = 1.0,
+    is_near_mode: NDArray[np.bool_] | None = None,
 ) -> NoiseSpectrum:
     """Estimate the noise spectrum and its lines from the residual of a fit.
 
@@ -133,9 +133,9 @@ def estimate_noise(
         Frequencies of the bins.
     sample_count : int
         Number of samples of the residual.
-    known_fraction : float
+    known_torque_fraction : float
         Fraction of the samples at which the residual is known. It is 0 at the others.
-    near_mode : ndarray of bool, shape (K,), optional
+    is_near_mode : ndarray of bool, shape (K,), optional
         True for bins near a mode, which are never excluded: an excluded resonance is not fitted,
         and would therefore always appear as a line. Without this argument no line is searched for.
 
@@ -144,22 +144,24 @@ def estimate_noise(
     NoiseSpectrum
         Smooth power and lines.
     """
-    noise_power = smooth_power(residual) / known_fraction
+    noise_power = smooth_power(residual) / known_torque_fraction
     is_compared = np.ones(noise_power.size, dtype=bool)
     noise_lines: list[NoiseLine] = []
-    if near_mode is None:
+    if is_near_mode is None:
         return NoiseSpectrum(noise_power, is_compared, ())
     for line_bins in _find_line_groups(residual, noise_power):
         line_power = np.abs(residual[line_bins]) ** 2
-        if near_mode[line_bins][np.argmax(line_power)] or not _lasts_through_record(
+        if is_near_mode[line_bins][np.argmax(line_power)] or not _lasts_through_record(
             residual, line_bins
         ):
             continue
-        is_compared[line_bins] &= near_mode[line_bins]
+        is_compared[line_bins] &= is_near_mode[line_bins]
         noise_lines.append(
             NoiseLine(
                 frequency_hz=float(line_power @ frequency_hz[line_bins] / line_power.sum()),
-                amplitude_nm=float(2 * np.sqrt(line_power.sum()) / (sample_count * known_fraction)),
+                amplitude_nm=float(
+                    2 * np.sqrt(line_power.sum()) / (sample_count * known_torque_fraction)
+                ),
             )
         )
     return NoiseSpectrum(noise_power, is_compared, tuple(noise_lines))

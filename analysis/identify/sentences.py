@@ -69,7 +69,7 @@ def headline_sentences(
             order_slope_sentence(headline, order_verdict) for order_verdict in order_verdicts
         ]
         sentences += _exact_order_sentences(headline)
-    if headline.explained:
+    if headline.is_explained:
         sentences.append(
             "The residual is white: this model suffices for this record."
             if without_rival
@@ -118,7 +118,7 @@ def _damping_sentences(
         damping_phrase = damping_phrase.replace("only", "alone is sufficient")
     sentences = [f"{damping_phrase}. Numbers are those of type {headline.name}, all orders free."]
     excluded_names = headline.structures_with_status("excluded")
-    if headline.explained and excluded_names:
+    if headline.is_explained and excluded_names:
         sentences.append(f"Excluded: {_list_structures(excluded_names)}.")
     if headline.simpler is not None and headline.simpler.fixed:
         sentences.append(_conditional_sentence(headline.simpler))

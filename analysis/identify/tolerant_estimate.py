@@ -180,7 +180,7 @@ def tolerant_estimate(
     TolerantEstimate or None
         None if fewer than two modes are visible.
     """
-    mode_numbers = fit.visible
+    mode_numbers = fit.visible_mode_numbers
     if len(mode_numbers) < _MIN_VISIBLE_MODES:
         return None
     wider_frequency_tolerance = max(_WIDER_FREQUENCY_TOLERANCE, uniformity)

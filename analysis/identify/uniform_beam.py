@@ -113,12 +113,12 @@ class UniformBeamProblem:
         tilt_deg: float | None = None,
         loss_tolerance: float = 0.0,
     ) -> None:
-        constant_rows = fit.rows(modes)
+        constant_rows = fit.constant_indices(modes)
         mode_count = len(modes)
         self.modes = tuple(modes)
         self.nominal = nominal
         self.uniformity = uniformity
-        self.measured = fit.constants[constant_rows]
+        self.measured = fit.mode_constants[constant_rows]
         tolerance_std = np.zeros((mode_count, len(MODE_CONSTANT_NAMES)))
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_frequency")] = uniformity
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_damping_ratio")] = loss_tolerance
@@ -273,7 +273,10 @@ class UniformBeamProblem:
             MODE_CONSTANT_NAMES.index("residue_phase_rad") :: len(MODE_CONSTANT_NAMES)
         ]
         phase_differences -= 2 * np.pi * np.round(phase_differences / (2 * np.pi))
-        return whitener @ differences, lambda: (whitener @ vibration.slopes() @ self.transform).T
+        return (
+            whitener @ differences,
+            lambda: (whitener @ vibration.constant_slopes() @ self.transform).T,
+        )
 
     def equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Return chi-square at one vector of unknowns with its gradient and Gauss-Newton matrix."""

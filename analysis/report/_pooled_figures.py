@@ -182,7 +182,7 @@ def _session_estimates_of_mode(
         return [
             modal_fit.mode(mode.number)
             for modal_fit in modal_fits
-            if modal_fit and mode.number in modal_fit.visible
+            if modal_fit and mode.number in modal_fit.visible_mode_numbers
         ]
     return [
         mode_estimate

@@ -175,7 +175,7 @@ def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
     other_resonances_hz = [
         f"{frequency_hz:.4g}"
         for mode_number, frequency_hz in zip(
-            modal_fit.numbers, modal_fit.model.frequencies_hz, strict=True
+            modal_fit.mode_numbers, modal_fit.model.frequencies_hz, strict=True
         )
         if mode_number == 0
     ]

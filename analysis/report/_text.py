@@ -250,7 +250,7 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
     if any(mode.damping_ratio.flag == CONTRADICTED_FILE_REASON for mode in headline.modes):
         return ()
     visible_modes = [_mode_text(mode) for mode in headline.modes if mode.shown]
-    if not headline.explained:
+    if not headline.is_explained:
         if not visible_modes:
             return ()
         return (

@@ -143,7 +143,7 @@ def test_fit_in_blocks_of_bins_agrees(monkeypatch, write_session, tmp_path):
     for module, name, most in (
         ("_comparison", "MAX_BINS_OF_STORED_RESULTS", 300),
         ("_modal_problem", "MAX_BINS_OF_STORED_RESULTS", 300),
-        ("_modal_problem", "_COLUMNS_AT_ONCE", 500),
+        ("_modal_problem", "_COLUMNS_PER_BLOCK", 500),
     ):
         monkeypatch.setattr(f"analysis.identify.{module}.{name}", most)
     in_blocks = fit_freest_alone(measurement, BAND_HZ)[0]

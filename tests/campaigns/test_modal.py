@@ -145,13 +145,15 @@ def test_parameters_include_the_stated_tilt(sessions_of, pooled_modal_model):
 
 def test_mode_visible_in_few_sessions_is_left_out(sessions_of, pooled_modal_model):
     first, *others = sessions_of(4, uniformity=0.0)
-    two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).restrict_to_visible_modes())
-    assert two.modal.constants.size == 2 * len(MODE_CONSTANT_NAMES)
+    two = replace(
+        first, modal=replace(first.modal, mode_numbers=(1, 2, 0)).restrict_to_visible_modes()
+    )
+    assert two.modal.mode_constants.size == 2 * len(MODE_CONSTANT_NAMES)
     assert two.modal.joint_covariance.shape == (13, 13)
     found = pooled_modal_model([two, *others])
-    assert found.visible == (1, 2)
+    assert found.visible_mode_numbers == (1, 2)
     many = pooled_modal_model([two, *sessions_of(12, first=1, uniformity=0.0)])
-    assert (many.visible, many.sessions) == (MODES, 12)
+    assert (many.visible_mode_numbers, many.sessions) == (MODES, 12)
     assert pooled_modal_model([first]) is None
     assert pooled_modal_model([replace(first, modal=None), others[0]]) is None
 
@@ -161,9 +163,9 @@ def test_phases_are_pooled_modulo_whole_turns(sessions_of, pooled_modal_model):
     turn = np.zeros(TRUE.size)
     turn[MODE_CONSTANT_NAMES.index("residue_phase_rad")] = 2 * np.pi
     modal = plain[2].modal
-    turned = replace(plain[2], modal=replace(modal, constants=modal.constants - turn))
+    turned = replace(plain[2], modal=replace(modal, mode_constants=modal.mode_constants - turn))
     one, other = pooled_modal_model(plain), pooled_modal_model([*plain[:2], turned, plain[3]])
-    assert other.constants == pytest.approx(one.constants, abs=1e-9)
+    assert other.mode_constants == pytest.approx(one.mode_constants, abs=1e-9)
     assert other.uniform_beam.chi_square == pytest.approx(one.uniform_beam.chi_square, rel=1e-6)
 
 

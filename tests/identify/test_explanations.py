@@ -302,7 +302,7 @@ def test_causes_are_reported_and_never_facts():
 
 def test_two_modes_cannot_distinguish_causes():
     fit = fitted(Elements(gravity_m_s2=TILT).constants())
-    two = replace(fit, numbers=(1, 2, 0))  # the third is of something else
+    two = replace(fit, mode_numbers=(1, 2, 0))  # the third is of something else
     assert explanations(uniform_beam_test(two, NOMINAL)) == ()
 
 
@@ -335,7 +335,7 @@ def test_losses_of_nonuniform_beam_have_a_tolerance():
 )
 def test_derivatives_of_modal_constants_match_differences(plain, altered):
     fit, rig = fitted(plain), replace(NOMINAL, filter_time_constant_s=2e-4, delay_s=1e-3)
-    problem = UniformBeamProblem(fit, fit.visible, rig)
+    problem = UniformBeamProblem(fit, fit.visible_mode_numbers, rig)
     terms = galerkin_mode_terms(BeamDeviations(**altered), rig.beam, problem.modes)
     x, unit, step = problem.starts()[0], np.eye(problem.constant_count), 1e-5
     slopes = problem.residual_and_slopes(x, unit, terms)[1]()

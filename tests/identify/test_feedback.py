@@ -9,7 +9,7 @@ import pytest
 from cases import further
 
 from analysis.identify import Comparison, Measurement, fit_freest_alone, fit_record
-from analysis.identify._instrument import reference_coherent_part
+from analysis.identify._instrument import reference_coherent_angle
 from analysis.models import STRUCTURES
 from analysis.record import load_record
 from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, transfer
@@ -78,17 +78,17 @@ def test_coherent_part_is_found_through_lag_and_noise():
     lag = np.exp(-np.arange(200) / 10.0)
     follows = np.convolve(reference, lag)[:n]
     noise = rng.normal(size=n) * 0.3 * follows.std()
-    found = reference_coherent_part(follows + noise, reference, 125.0)
+    found = reference_coherent_angle(follows + noise, reference, 125.0)
     assert np.std(found - follows) < 0.2 * noise.std()
 
 
 def test_angle_equal_to_reference_is_fully_coherent():
     angle = np.random.default_rng(2).normal(size=5000)
-    assert reference_coherent_part(angle, angle, 125.0) == pytest.approx(angle, abs=1e-6)
+    assert reference_coherent_angle(angle, angle, 125.0) == pytest.approx(angle, abs=1e-6)
 
 
 def test_no_part_is_coherent_with_constant_reference():
-    assert not reference_coherent_part(np.ones(500), np.zeros(500), 125.0).any()
+    assert not reference_coherent_angle(np.ones(500), np.zeros(500), 125.0).any()
 
 
 @pytest.mark.fit
@@ -113,7 +113,7 @@ def test_a_reference_may_end_anywhere():
     reference = 0.1 * rng.normal(size=n) * np.hanning(n) + np.where(np.arange(n) < 15_000, 0.0, 3.0)
     lag = np.exp(-np.arange(200) / 10.0) / 10.0
     follows = np.convolve(reference, lag)[:n]
-    found = reference_coherent_part(follows, reference, 125.0)
+    found = reference_coherent_angle(follows, reference, 125.0)
     assert np.abs(found - follows)[-125:].max() < 0.01 * follows[-1]
 
 

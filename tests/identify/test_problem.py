@@ -85,7 +85,7 @@ def test_torques_are_replaced_after_a_descent(sessions, monkeypatch, most, hopel
         StepRule.for_unknowns(unknowns, VANISHING_LOSS),
         relative_tolerance=1e-8,
         max_evaluations=most,
-        hopeless=hopeless,
+        give_up_condition=hopeless,
     )
     assert (len(evaluated) > found.evaluations) == again
     assert again or found.evaluations == 5
@@ -96,7 +96,7 @@ def test_free_decay_and_drifting_zero_do_not_count(objective):
     at = objective.linearise(x)
     projected = objective.project(at, 2.0)
     ringing = np.array([0.3, -0.2, 0.1, 0.2, 0.0, 0.4, 0.05])  # of three modes, then the drift
-    torques = objective.unknown_torques(at)
+    torques = objective.unknown_torque_spectra(at)
     with_more = type(at)(at.residual + ringing @ torques, at.jacobian, at.poles)
     again = objective.project(with_more, 2.0)
     assert again.residual == pytest.approx(projected.residual, abs=1e-6)

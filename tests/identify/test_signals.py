@@ -109,7 +109,7 @@ def white(seed):
 def test_a_hum_is_a_line(hz, amplitude):
     wander = 0.01 * np.sin(2 * np.pi * TIME_S / 40)
     hum = amplitude * np.sin(2 * np.pi * (hz * TIME_S + wander) + 1)
-    noise = estimate_noise(spectrum(white(6) + hum), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE)
+    noise = estimate_noise(spectrum(white(6) + hum), FREQUENCY_HZ, SAMPLES, is_near_mode=NOWHERE)
     (line,) = noise.lines
     assert line.frequency_hz == pytest.approx(hz, abs=0.003)
     assert line.amplitude_nm == pytest.approx(amplitude, rel=0.06)
@@ -124,7 +124,7 @@ def test_intermittent_signal_is_no_line():
     decay = np.where(TIME_S > 40, np.exp(-0.5 * np.maximum(TIME_S - 40, 0)), 0)
     passing = decay * np.sin(2 * np.pi * 16 * TIME_S)
     noise = estimate_noise(
-        spectrum(white(7) + 0.2 * passing), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE
+        spectrum(white(7) + 0.2 * passing), FREQUENCY_HZ, SAMPLES, is_near_mode=NOWHERE
     )
     assert noise.lines == ()
     assert noise.is_compared.all()
@@ -133,21 +133,21 @@ def test_intermittent_signal_is_no_line():
 
 def test_white_noise_has_no_lines():
     for seed in range(20):
-        noise = estimate_noise(spectrum(white(seed)), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE)
+        noise = estimate_noise(spectrum(white(seed)), FREQUENCY_HZ, SAMPLES, is_near_mode=NOWHERE)
         assert noise.lines == ()
         assert np.mean(noise.power) == pytest.approx(SAMPLES * 4e-3**2, rel=0.06)
 
 
 def test_unknown_samples_do_not_lower_the_noise():
     half = np.where(np.arange(SAMPLES) % 2 == 0, white(3), 0)
-    noise = estimate_noise(spectrum(half), FREQUENCY_HZ, SAMPLES, known_fraction=0.5)
+    noise = estimate_noise(spectrum(half), FREQUENCY_HZ, SAMPLES, known_torque_fraction=0.5)
     assert np.mean(noise.power) == pytest.approx(SAMPLES * 4e-3**2, rel=0.06)
 
 
 def test_a_resonance_is_never_left_out():
     hum = spectrum(white(6) + 0.02 * np.sin(2 * np.pi * 16.7 * TIME_S))
     for near_mode in (None, np.abs(FREQUENCY_HZ - 16.6) < 0.2):
-        noise = estimate_noise(hum, FREQUENCY_HZ, SAMPLES, near_mode=near_mode)
+        noise = estimate_noise(hum, FREQUENCY_HZ, SAMPLES, is_near_mode=near_mode)
         assert noise.lines == ()
         assert noise.is_compared.all()
 

@@ -28,7 +28,7 @@ def test_dry_friction_is_reported_without_bias_of_modes(sessions, plants, link, 
     assert finding.kind == "friction"
     assert (finding.value, finding.interval) == (None, None)
     headline = selection.headline
-    assert headline.explained
+    assert headline.is_explained
     assert headline.uniform_beam.status == "passed"
     for mode, true in zip(headline.modes, modes(link, plants["III"], 3), strict=True):
         for found, expected in (

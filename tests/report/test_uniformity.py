@@ -52,8 +52,8 @@ def test_band_of_the_modal_model_matches_scatter_of_draws(modal_result):
     modal = modal_result.whole.headline.modal
     frequency_hz = np.array([1.5, 2.55, 5.0, 11.0, 16.0, 30.0, 44.0, 48.0])
     band = modal_response_band(modal, frequency_hz)
-    count = modal.constants.size
-    at = np.concatenate([modal.constants, modal.model.background])
+    count = modal.mode_constants.size
+    at = np.concatenate([modal.mode_constants, modal.model.background])
     factor = np.linalg.cholesky(
         modal.joint_covariance / np.outer(*[np.sqrt(np.diag(modal.joint_covariance))] * 2)
     )
