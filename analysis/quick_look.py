@@ -169,7 +169,9 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
                 record.metadata, record.angle_rad, record.rate_hz, headline.fit.plant
             )
             remark_sentences.append(
-                f"The record is long ({duration_s:.0f} s): type {headline.name} alone was fitted; non-uniform beams, air drag, nonlinear forces and changes along the record were not tried. analyze tries them."
+                f"The record is long ({duration_s:.0f} s): type {headline.name} alone was "
+                "fitted; non-uniform beams, air drag, nonlinear forces and changes along the "
+                "record were not tried. analyze tries them."
             )
     except MeasurementError as error:
         no_modes_sentence = f"No modes: {_remove_file_name(str(error), record.path)}"
@@ -378,7 +380,8 @@ def _stored_quick_look(session_path: Path) -> dict[str, Any]:
     quick_look = read_quick_look(quick_look_path(session_path))
     if quick_look is None:
         raise QuickLookError(
-            f"--last {session_path}: there is no readable quick look next to it; make one with python -m analysis.quick_look {session_path}."
+            f"--last {session_path}: there is no readable quick look next to it; make one with "
+            f"python -m analysis.quick_look {session_path}."
         )
     return quick_look
 
@@ -467,7 +470,8 @@ def _text_lines(quick_look_document: Mapping[str, Any]) -> Iterator[str]:
     )
     # The intervals do not include scale of the torque, length and density of the beam.
     yield (
-        f"Quick look at {quick_look_document['session_id']}{specimen_text}; ± 95 %, statistical only:"
+        f"Quick look at {quick_look_document['session_id']}{specimen_text}; ± 95 %, statistical "
+        "only:"
     )
     modes = modes_from_json(quick_look_document["modes"])
     shown_modes = [mode for mode in modes if mode.shown]

@@ -331,7 +331,9 @@ def whole_record(
 
     check_excited_band(record, band_hz)
     band_hz = record_band_hz(record, band_hz)
-    selection = select(Measurement.from_record(record), fixed=fixed_parameters, band_hz=band_hz)
+    selection = select(
+        Measurement.from_record(record), fixed_settings=fixed_parameters, band_hz=band_hz
+    )
     return WholeRecord(record, selection, band_hz, fixed_parameters)
 
 

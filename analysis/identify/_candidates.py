@@ -15,7 +15,7 @@ from analysis.identify._fit import fit_record, refit_record
 from analysis.identify._leakage import without_leakage
 from analysis.identify._refit import (
     DESCENT_EVALUATIONS,
-    MISSED_COST_FRACTION,
+    MISSED_MINIMUM_COST_FRACTION,
     REFIT_EVALUATIONS,
     Refit,
 )
@@ -410,7 +410,7 @@ class CandidateSet:
         ):
             return candidate
         start_refit = self.descend_from_plant(plant, structure, 1)
-        cost_to_beat = candidate.fit.cost * (1 - MISSED_COST_FRACTION)
+        cost_to_beat = candidate.fit.cost * (1 - MISSED_MINIMUM_COST_FRACTION)
         if start_refit.predicted_cost > cost_to_beat:
             return candidate
         first_descent = start_refit.continue_descent(REFIT_EVALUATIONS)

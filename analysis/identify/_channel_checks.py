@@ -55,7 +55,8 @@ def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
     yield Finding(
         kind="clipping",
         sentence=(
-            f"The torque is clipped at {limits_text}: {clipped_tick_count} values lie exactly there and none beyond, and no flag says so."
+            f"The torque is clipped at {limits_text}: {clipped_tick_count} values lie exactly "
+            "there and none beyond, and no flag says so."
         ),
         value=max(abs(extreme.limit_nm) for extreme in clipped_extremes),
         unit="N·m",
@@ -88,7 +89,9 @@ def standstill_findings(measurement: Measurement) -> Iterator[Finding]:
     yield Finding(
         kind="stop",
         sentence=(
-            f"The motor does not move from {first_still_block * _STANDSTILL_BLOCK_S:.1f} to {(first_still_block + longest_still_blocks) * _STANDSTILL_BLOCK_S:.1f} s of the record, although its reference does."
+            f"The motor does not move from {first_still_block * _STANDSTILL_BLOCK_S:.1f} to "
+            f"{(first_still_block + longest_still_blocks) * _STANDSTILL_BLOCK_S:.1f} s of the "
+            "record, although its reference does."
         ),
         value=longest_still_blocks * _STANDSTILL_BLOCK_S,
         unit="s",
@@ -164,10 +167,12 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
         yield Finding(
             kind="sign",
             sentence=(
-                "Torque or angle has the wrong sign: the torque is opposite to that of the beam at nearly all frequencies. No number here is valid for the antenna."
+                "Torque or angle has the wrong sign: the torque is opposite to that of the beam "
+                "at nearly all frequencies. No number here is valid for the antenna."
             ),
             remedy=(
-                "Reverse the sign of one channel: the torque is positive where the motor pushes the beam towards positive angles."
+                "Reverse the sign of one channel: the torque is positive where the motor pushes "
+                "the beam towards positive angles."
             ),
         )
     median_magnitude = _weighted_median(ratio_magnitude, np.sqrt(expected_power))
@@ -192,7 +197,8 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     yield Finding(
         kind="unit",
         sentence=(
-            f"Torque over angle is {median_magnitude:.3g} times what the beam in the file gives, {explanation}. No number here is valid for the antenna."
+            f"Torque over angle is {median_magnitude:.3g} times what the beam in the file gives, "
+            f"{explanation}. No number here is valid for the antenna."
         ),
         value=median_magnitude,
         remedy="Check the units of angle and torque, and import the record again.",

@@ -564,7 +564,7 @@ class Comparison:
                 ln_density_derivative=band_spectrum(drag_torque.ln_density_derivative),
                 delay_derivative=band_spectrum(drag_torque.delay_derivative),
                 law_derivatives=band_spectrum(drag_torque.law_derivatives),
-                speed_m_s=drag_torque.speed_m_s,
+                mean_speed_m_s=drag_torque.mean_speed_m_s,
                 top_speed_m_s=drag_torque.top_speed_m_s,
             ),
         )

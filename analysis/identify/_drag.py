@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._candidate import DragEstimate
-from analysis.identify._refit import MISSED_COST_FRACTION, Refit
+from analysis.identify._refit import MISSED_MINIMUM_COST_FRACTION, Refit
 from analysis.identify.drag_torque import (
     HALF_AIR_DENSITY_KG_PER_M3,
     DragError,
@@ -336,7 +336,7 @@ def _converged_drag_fit(
                 max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             )
         vector_of_unknowns, law, noise = refit.x, _law_at_minimum(refit), refit.residual_noise()
-        if law.at(drag_expansion.speed_m_s) <= 0:
+        if law.drag_at_speed_m(drag_expansion.mean_speed_m_s) <= 0:
             return None
         comparison = None
     return None
@@ -356,7 +356,7 @@ def _law_at_minimum(refit: Refit) -> DragLaw:
     drag_expansion = refit.objective.comparison.drag
     assert drag_expansion is not None
     law_coefficient_changes = refit.amplitudes()[0].tolist()
-    decreasing_part = drag_expansion.law.decreasing_part + (
+    decreasing_part = drag_expansion.law.decreasing_coefficient + (
         law_coefficient_changes[1] if len(law_coefficient_changes) > 1 else 0.0
     )
     return DragLaw(drag_expansion.law.constant_m + law_coefficient_changes[0], decreasing_part)
@@ -386,8 +386,8 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
             candidate_set_with_drag.noise,
             candidate_set_with_drag.effect_spectra,
             max_evaluations=_SHORT_DESCENT_EVALUATIONS,
-            relative_tolerance=MISSED_COST_FRACTION,
-            hopeless=(_EVALUATIONS_BEFORE_GIVING_UP, cost_limit),
+            relative_tolerance=MISSED_MINIMUM_COST_FRACTION,
+            give_up_condition=(_EVALUATIONS_BEFORE_GIVING_UP, cost_limit),
         )
         short_descents.append((refit.candidate(), refit))
     candidates = [
@@ -411,7 +411,7 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
     covariance = covariance * freest_candidate.fit.cost / freest_candidate.fit.degrees_of_freedom
     drag_expansion = refit.objective.comparison.drag
     assert drag_expansion is not None
-    pivot_speed_m_s = drag_expansion.speed_m_s
+    pivot_speed_m_s = drag_expansion.mean_speed_m_s
     law_coefficient_weights = np.ones(1)
     if len(covariance) > 1:
         pivot_coefficient_weight = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
@@ -425,7 +425,7 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
         )
         law_coefficient_weights = np.array([1.0, pivot_speed_m_s ** (-2 / 3)])
     drag_m, std = (
-        law.at(pivot_speed_m_s),
+        law.drag_at_speed_m(pivot_speed_m_s),
         math.sqrt(float(law_coefficient_weights @ covariance @ law_coefficient_weights)),
     )
     return DragEstimate(
@@ -484,9 +484,9 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
     if drag_estimate is None:
         return ()
     fit = candidate_set.best.fit
-    law_coefficients = np.array([drag_estimate.law.constant_m, drag_estimate.law.decreasing_part])[
-        : len(drag_estimate.covariance)
-    ]
+    law_coefficients = np.array(
+        [drag_estimate.law.constant_m, drag_estimate.law.decreasing_coefficient]
+    )[: len(drag_estimate.covariance)]
     covariance = np.array(drag_estimate.covariance)
     damping_estimates = []
     for mode_estimate in fit.modes:

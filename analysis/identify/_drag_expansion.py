@@ -65,8 +65,8 @@ class DragExpansion:
     ln_density_derivative, delay_derivative : ndarray of complex, shape (K,)
         Derivatives by ln(mass per length) and by the delay of the torque.
     law_derivatives : ndarray of complex, shape (2, K)
-        Derivatives by `DragLaw.constant_m` and `DragLaw.decreasing_part`.
-    speed_m_s, top_speed_m_s : float
+        Derivatives by `DragLaw.constant_m` and `DragLaw.decreasing_coefficient`.
+    mean_speed_m_s, top_speed_m_s : float
         Mean and highest speed of the beam, as in `DragTorque`.
     """
 
@@ -79,7 +79,7 @@ class DragExpansion:
     ln_density_derivative: ComplexArray
     delay_derivative: ComplexArray
     law_derivatives: ComplexArray
-    speed_m_s: float
+    mean_speed_m_s: float
     top_speed_m_s: float
 
     def torque_change_to(

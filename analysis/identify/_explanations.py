@@ -126,7 +126,7 @@ def explanations(test: UniformBeamTest) -> tuple[CauseFit, ...]:
 
     The test has refused the plain uniform beam.
     """
-    problem, best_beam_unknowns = test.problem, test.unknowns
+    problem, best_beam_unknowns = test.problem, test.best_fit_unknowns
     if problem is None:
         return ()
     middle_start = problem.starts()[len(problem.starts()) // 2]

@@ -106,7 +106,7 @@ def fit_record(
     nominal_plant = measurement.nominal_plant
     coarse_response = CoarseResponse(comparison)
     searches = [
-        StructureSearch.start(Objective(comparison, unknowns), coarse_response)
+        StructureSearch.from_objective(Objective(comparison, unknowns), coarse_response)
         for unknowns in (
             Unknowns.for_structure(structure, nominal_plant, free_names) for structure in structures
         )
@@ -128,7 +128,7 @@ def fit_record(
         comparison = reference_descent.objective.comparison
         coarse_response = CoarseResponse(comparison)
         searches = [
-            StructureSearch.start(Objective(comparison, search.unknowns), coarse_response)
+            StructureSearch.from_objective(Objective(comparison, search.unknowns), coarse_response)
             for search in searches
         ]
     # The incoherent part of the angle may contain the beam's motion, and not noise alone. It is

@@ -458,7 +458,7 @@ def _impact_with_amplitudes(refit: Refit, first_sample: int, end_sample: int) ->
     cost_before, expected_cost = refit.cost, refit.expected_cost
     are_beam_unknowns_free = bool(cost_before < _OVERWHELMING_COST_RATIO * expected_cost)
     unexplained_spectra, residual = refit.unexplained_spectra(
-        comparison.spectrum(unit_torques), beam_free=are_beam_unknowns_free
+        comparison.spectrum(unit_torques), are_beam_unknowns_free=are_beam_unknowns_free
     )
     real_unexplained_spectra = unexplained_spectra.view(np.float64)
     spectrum_norms = np.linalg.norm(real_unexplained_spectra, axis=1)

@@ -232,7 +232,7 @@ class Objective:
             Unknowns at which the descent starts.
         noise_weight : ndarray, shape (K,)
             Weight of `NoiseSpectrum`.
-        region, relative_tolerance, max_evaluations, hopeless
+        region, relative_tolerance, max_evaluations, give_up_condition
             Arguments of `descend`.
 
         Returns

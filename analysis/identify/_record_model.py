@@ -18,7 +18,7 @@ from analysis.identify._drag import refit_with_air_drag, small_drag_spectrum
 from analysis.identify._modal_fit import fit_modes
 from analysis.identify._modes_with_drag import fit_modes_with_drag, mode_numbers_changed_by_drag
 from analysis.identify._nonlinear import add_nonlinear_forces
-from analysis.identify._small_effects import LARGE_DEVIANCE_REDUCTION, small_effect
+from analysis.identify._small_effects import LARGE_EFFECT_DEVIANCE_REDUCTION, likeliest_small_effect
 from analysis.identify._step_in_time import best_stiffness_step
 from analysis.identify._time_varying import find_temporal_changes
 from analysis.identify._visible_modes import visible_modes
@@ -152,8 +152,8 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     if linear_fit is None:
         return RecordModel(linear_candidates, None, linear_candidates, None, explains_record=False)
     is_single_sweep = linear_candidates.comparison.measurement.is_single_sweep
-    drag_spectrum = _small_drag(linear_candidates, linear_fit)
-    effect = small_effect(
+    drag_spectrum = _small_drag_spectra(linear_candidates, linear_fit)
+    likeliest_effect = likeliest_small_effect(
         linear_candidates.comparison,
         linear_fit,
         linear_fit.plant_with_modal_frequencies(linear_candidates.likeliest_fit.plant),
@@ -161,8 +161,12 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     )
     modes_with_drag, changed_by_drag = None, tuple[int, ...]()
     # In a single sweep another effect, or large drag, has a model of its own.
-    if effect is None or not is_single_sweep or (effect.kind == "air drag" and not effect.is_large):
-        modes_with_drag, changed_by_drag = _accepted_drag(
+    if (
+        likeliest_effect is None
+        or not is_single_sweep
+        or (likeliest_effect.kind == "air drag" and not likeliest_effect.is_large)
+    ):
+        modes_with_drag, changed_by_drag = _drag_fit_or_doubtful_modes(
             linear_fit,
             fit_modes_with_drag(linear_candidates, linear_fit, drag_spectrum),
             lambda modal_fit: _explains_record(linear_candidates, modal_fit, band_hz),
@@ -172,16 +176,19 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
         explains_record = _explains_record(linear_candidates, linear_fit, band_hz)
     else:
         modal_fit, explains_record = modes_with_drag.modal_fit, True
-        if effect is not None and (
-            effect.kind == "air drag" or not effect.is_significant_with(modal_fit)
+        if likeliest_effect is not None and (
+            likeliest_effect.kind == "air drag"
+            or not likeliest_effect.has_significant_amplitude_in(modal_fit)
         ):
-            effect = None
+            likeliest_effect = None
     model = RecordModel(
         linear_candidates, linear_fit, linear_candidates, modal_fit, explains_record,
         modes_with_drag=modes_with_drag,
         modes_changed_by_drag=changed_by_drag,
     )  # fmt: skip
-    return model if effect is None else _with_small_effect(model, effect, band_hz)
+    return (
+        model if likeliest_effect is None else _add_small_effect(model, likeliest_effect, band_hz)
+    )
 
 
 def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> RecordModel:
@@ -189,9 +196,9 @@ def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> Rec
 
     `model` is the result of `fit_linear_model`.
     """
-    is_large = model.small_effect is not None and model.small_effect.is_large
-    if model.explains_record and not is_large:
-        return _with_fitted_candidates(model)
+    is_small_effect_large = model.small_effect is not None and model.small_effect.is_large
+    if model.explains_record and not is_small_effect_large:
+        return _fit_candidates(model)
     is_single_sweep = model.linear_candidates.comparison.measurement.is_single_sweep
     if model.linear_fit is not None and is_single_sweep:
         stiffness_step = _likely_stiffness_step(model, model.linear_fit)
@@ -206,7 +213,7 @@ def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> Rec
                 ),
             )
             if model.explains_record:
-                return _with_fitted_candidates(model)
+                return _fit_candidates(model)
     candidate_set, nonlinear_forces, temporal_changes = _fit_further_effects(
         model.linear_candidates, test_amplitude_effects=model.stiffness_step is None
     )
@@ -239,16 +246,18 @@ def fit_drag_with_modes(
     modes_with_drag = fit_modes_with_drag(
         candidate_set,
         modal_fit,
-        _small_drag(candidate_set, modal_fit),
+        _small_drag_spectra(candidate_set, modal_fit),
         max_computations=max_computations,
     )
-    return _accepted_drag(modal_fit, modes_with_drag, lambda with_drag: with_drag.residual_is_noise)
+    return _drag_fit_or_doubtful_modes(
+        modal_fit, modes_with_drag, lambda fit_with_drag: fit_with_drag.residual_is_noise
+    )
 
 
-def _accepted_drag(
+def _drag_fit_or_doubtful_modes(
     modal_fit: ModalFit,
     modes_with_drag: ModesWithDrag | None,
-    explains_record: Callable[[ModalFit], bool],
+    does_explain_record: Callable[[ModalFit], bool],
 ) -> tuple[ModesWithDrag | None, tuple[int, ...]]:
     """Return the modes with drag if they explain the record, else None and the modes in doubt.
 
@@ -256,7 +265,7 @@ def _accepted_drag(
     """
     if modes_with_drag is None:
         return None, ()
-    if modes_with_drag.has_converged and explains_record(modes_with_drag.modal_fit):
+    if modes_with_drag.has_converged and does_explain_record(modes_with_drag.modal_fit):
         return modes_with_drag, ()
     return None, mode_numbers_changed_by_drag(modal_fit, modes_with_drag.modal_fit)
 
@@ -298,7 +307,8 @@ def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]
             mode_starts.append((mode_number, mode.frequency_hz, mode.damping_ratio))
             continue
         nearest_mode = min(
-            oscillating_modes.values(), key=lambda each: abs(each.number - mode_number)
+            oscillating_modes.values(),
+            key=lambda mode_estimate: abs(mode_estimate.number - mode_number),
         )
         frequency_ratio = (
             beam_eigenvalues[mode_number - 1] / beam_eigenvalues[nearest_mode.number - 1]
@@ -324,14 +334,14 @@ def _explains_record(
     )
 
 
-def _small_drag(candidate_set: CandidateSet, modal_fit: ModalFit) -> NDArray[np.complex128]:
+def _small_drag_spectra(candidate_set: CandidateSet, modal_fit: ModalFit) -> NDArray[np.complex128]:
     """Return the torque spectrum of a small drag on a beam with the fitted modes, shape (K,)."""
     plant = modal_fit.uniform_plant(candidate_set.comparison.measurement.nominal_plant)
     drag_spectra = small_drag_spectrum(candidate_set.comparison, plant, modal_fit)
     return np.asarray(drag_spectra[0])
 
 
-def _with_small_effect(
+def _add_small_effect(
     model: RecordModel, effect: SmallEffect, band_hz: tuple[float, float]
 ) -> RecordModel:
     """Fit a small effect together with the modes, and with the drag if there is any."""
@@ -349,17 +359,19 @@ def _with_small_effect(
     )
 
 
-def _with_fitted_candidates(model: RecordModel) -> RecordModel:
+def _fit_candidates(model: RecordModel) -> RecordModel:
     """Refit the candidates with the drag of the model, or with its small effect if it is large."""
     linear_candidates, modes_with_drag = model.linear_candidates, model.modes_with_drag
     if modes_with_drag is not None:
-        with_drag = replace(linear_candidates, comparison=modes_with_drag.comparison)
+        candidates_with_drag = replace(linear_candidates, comparison=modes_with_drag.comparison)
         return replace(
             model,
-            candidate_set=with_drag.refit_with_additional_effect(modes_with_drag.drag_spectra),
+            candidate_set=candidates_with_drag.refit_with_additional_effect(
+                modes_with_drag.drag_spectra
+            ),
         )
     effect = model.small_effect
-    if effect is None or effect.deviance_reduction <= LARGE_DEVIANCE_REDUCTION:
+    if effect is None or effect.deviance_reduction <= LARGE_EFFECT_DEVIANCE_REDUCTION:
         return model
     candidate_set = linear_candidates.refit_with_additional_effect(effect.torque_spectrum[None])
     return replace(model, candidate_set=candidate_set, modal_fit=fit_modal_model(candidate_set))
@@ -419,5 +431,7 @@ def _likely_stiffness_step(model: RecordModel, linear_fit: ModalFit) -> Stiffnes
     rival_deviance_reduction = (
         0.0 if model.small_effect is None else model.small_effect.deviance_reduction
     )
-    is_likeliest = stiffness_step.score > max(rival_deviance_reduction, LARGE_DEVIANCE_REDUCTION)
+    is_likeliest = stiffness_step.score > max(
+        rival_deviance_reduction, LARGE_EFFECT_DEVIANCE_REDUCTION
+    )
     return stiffness_step if is_likeliest else None

@@ -37,7 +37,7 @@ DESCENT_EVALUATIONS: Final = 40
 """Number of evaluations of the sum of squares after which a descent from another start has
 converged."""
 
-MISSED_COST_FRACTION: Final = 1e-5
+MISSED_MINIMUM_COST_FRACTION: Final = 1e-5
 """Fraction of a sum of squares (some 1e4) by which a lower minimum counts as missed. The BIC
 penalty of a parameter is 9."""
 
@@ -71,34 +71,34 @@ class Refit:
         cls,
         comparison: Comparison,
         unknowns: Unknowns,
-        start: NDArray[np.float64],
+        start_vector: NDArray[np.float64],
         noise: NoiseSpectrum,
         torque_spectra: NDArray[np.complex128] | None = None,
         *,
         max_evaluations: int = 60,
         relative_tolerance: float = _COST_TOLERANCE,
-        held_unknowns: Sequence[str] = (),
-        hopeless: tuple[int, float] | None = None,
+        fixed_unknowns: Sequence[str] = (),
+        give_up_condition: tuple[int, float] | None = None,
     ) -> Refit:
         """Descend from a start vector, after unknown torques are filled with the prediction there.
 
         `torque_spectra`, shape (c, K), are torque spectra of unknown size that are projected out in
-        addition to the free decay. `held_unknowns` names unknowns that keep their start values.
-        `relative_tolerance` is that of `analysis.optimizer.descend`, and `hopeless` its
+        addition to the free decay. `fixed_unknowns` names unknowns that keep their start values.
+        `relative_tolerance` is that of `analysis.optimizer.descend`, and `give_up_condition` its
         `early_stop_limits`. With `max_evaluations` of 1 the start is only evaluated.
         """
-        descent_steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
-        x = np.clip(start, descent_steps.lower, descent_steps.upper)
-        for held_name in held_unknowns:
-            held_index = unknowns.names.index(held_name)
-            descent_steps.lower[held_index] = descent_steps.upper[held_index] = x[held_index]
+        step_rule = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
+        x = np.clip(start_vector, step_rule.lower, step_rule.upper)
+        for fixed_name in fixed_unknowns:
+            fixed_index = unknowns.names.index(fixed_name)
+            step_rule.lower[fixed_index] = step_rule.upper[fixed_index] = x[fixed_index]
         objective, minimum = Objective(comparison, unknowns, torque_spectra).minimum(
             x,
             noise.weight,
-            descent_steps,
+            step_rule,
             relative_tolerance=relative_tolerance,
             max_evaluations=max_evaluations,
-            give_up_condition=hopeless,
+            give_up_condition=give_up_condition,
         )
         return cls(objective, minimum.x, minimum.equations, noise)
 
@@ -191,20 +191,20 @@ class Refit:
         ], covariance
 
     def unexplained_spectra(
-        self, torque_spectra: NDArray[np.complex128], *, beam_free: bool = True
+        self, torque_spectra: NDArray[np.complex128], *, are_beam_unknowns_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Return the part of whitened torque spectra that other free terms do not explain, (c, K).
 
-        The free terms are the disturbances of unknown amplitude and, with `beam_free`, the unknowns
-        of the beam. The whitened residual (prediction minus measurement), shape (K,), is returned
-        as well.
+        The free terms are the disturbances of unknown amplitude and, with `are_beam_unknowns_free`,
+        the unknowns of the beam. The whitened residual (prediction minus measurement), shape (K,),
+        is returned as well.
         """
         noise_weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, noise_weight)
         explaining_spectra = self.objective.unknown_torque_spectra(linearisation) * noise_weight
-        if beam_free:
+        if are_beam_unknowns_free:
             explaining_spectra = np.concatenate([projected_objective.jacobian, explaining_spectra])
-        return unexplained_part(
+        return part_outside_spectra(
             torque_spectra * noise_weight, explaining_spectra
         ), projected_objective.residual
 
@@ -245,8 +245,12 @@ class Refit:
         )
         # Inverse covariance of the decays alone, the other amplitudes free (Schur complement).
         decay_precision = decay_gram - cross_gram @ np.linalg.solve(column_gram, cross_gram.T)
-        a = (projected_objective.amplitudes * gram_scale)[:decay_count]
-        chi_square = float(a @ decay_precision @ a) * fit.degrees_of_freedom / fit.cost
+        scaled_amplitudes = (projected_objective.amplitudes * gram_scale)[:decay_count]
+        chi_square = (
+            float(scaled_amplitudes @ decay_precision @ scaled_amplitudes)
+            * fit.degrees_of_freedom
+            / fit.cost
+        )
         return replace(
             fit, ringing=replace(fit.ringing, chi_square=chi_square, degrees_of_freedom=decay_count)
         )
@@ -263,7 +267,7 @@ class Refit:
         return replace(self.noise, power=smooth_power(unwhitened_residual) / known_fraction)
 
 
-def unexplained_part(
+def part_outside_spectra(
     whitened_spectra: NDArray[np.complex128], explaining_spectra: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
     """Return the part of whitened spectra that other free terms do not explain, shape (c, K).

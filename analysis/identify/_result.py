@@ -104,7 +104,7 @@ class RecordFit:
         return {name: std if name in self.interval else None for name, std in self.std.items()}
 
     @property
-    def free_parameters(self) -> int:
+    def free_parameter_count(self) -> int:
         """Return the number of estimated parameters."""
         return len(self.determined) + len(self.at_bounds)
 
@@ -119,7 +119,7 @@ class RecordAnalysis:
         Fits in the requested order; their costs are comparable.
     frequency_hz : ndarray, shape (K,)
         Frequencies of the bins of the residuals.
-    compared : ndarray of bool, shape (K,)
+    is_compared : ndarray of bool, shape (K,)
         False at the bins of `lines`, where the residuals are 0.
     noise_nm2_per_hz : ndarray, shape (K,)
         One-sided power spectral density of the torque's noise, without lines.
@@ -131,7 +131,7 @@ class RecordAnalysis:
 
     fits: tuple[RecordFit, ...]
     frequency_hz: NDArray[np.float64]
-    compared: NDArray[np.bool_]
+    is_compared: NDArray[np.bool_]
     noise_nm2_per_hz: NDArray[np.float64]
     lines: tuple[NoiseLine, ...]
     comparison: Comparison
@@ -154,7 +154,7 @@ class RecordAnalysis:
         return cls(
             fits=tuple(fits),
             frequency_hz=comparison.frequency_hz,
-            compared=noise.is_compared,
+            is_compared=noise.is_compared,
             noise_nm2_per_hz=2
             * noise.power
             / (comparison.sample_count * comparison.decimation.rate_hz),
@@ -166,7 +166,7 @@ class RecordAnalysis:
     def noise(self) -> NoiseSpectrum:
         """Return the noise spectrum of the torque under which the fits were made."""
         density_factor = self.comparison.sample_count * self.comparison.decimation.rate_hz / 2
-        return NoiseSpectrum(self.noise_nm2_per_hz * density_factor, self.compared, self.lines)
+        return NoiseSpectrum(self.noise_nm2_per_hz * density_factor, self.is_compared, self.lines)
 
     def fit_percent(self, fit: FitWithResidual) -> float:
         """Return how well a model fits the measured torque in the band, in per cent (NRMSE).

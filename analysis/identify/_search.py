@@ -37,20 +37,24 @@ if TYPE_CHECKING:
 
 # Resonances
 
-_LN_RATIO_SHIFTS: Final = np.linspace(-0.5, 0.5, 101)
+_LN_DENSITY_RATIO_SHIFTS: Final = np.linspace(-0.5, 0.5, 101)
 """Shifts of ln(rho/EI) at which the resonances are compared with the record."""
 
-_SCAN_DAMPING: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
+_SCAN_DAMPING_UNKNOWNS: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
 """Damping at which the shifts are compared, as `Unknowns.start` accepts it."""
 
 
-def resonance_shift(coarse_response: CoarseResponse, unknowns: Unknowns) -> NDArray[np.float64]:
+def unknowns_shift_to_resonances(
+    coarse_response: CoarseResponse, unknowns: Unknowns
+) -> NDArray[np.float64]:
     """Return the shift of the unknowns that aligns the resonances with the record, (k,).
 
     If a resonance is off by more than its width, no descent finds it.
     """
     moderate_damping_start = unknowns.start(
-        np.array([_SCAN_DAMPING[parameter_name] for parameter_name in unknowns.structure.free])
+        np.array(
+            [_SCAN_DAMPING_UNKNOWNS[parameter_name] for parameter_name in unknowns.structure.free]
+        )
     )
     aligning_shift = np.zeros(moderate_damping_start.size)
     if "density_over_stiffness" in unknowns.names:
@@ -68,13 +72,13 @@ _COARSE_POINTS: Final = 400
 _COARSE_COST_TOLERANCE: Final = 1e-2
 """Relative tolerance of the cost in a descent on the coarse response."""
 
-_SAME_MINIMUM_FRACTION: Final = 0.05
+_SAME_MINIMUM_DISTANCE: Final = 0.05
 """Minima whose plants differ by less than this fraction of the cost count as one."""
 
 _MAX_COARSE_EVALUATIONS: Final = 60
 """Largest number of evaluations in a descent on the coarse response."""
 
-_START_LN_SIZES: Final = {
+_LN_START_COEFFICIENTS: Final = {
     name: tuple(np.log([1e-4, 1e-3, 1e-2, 1e-1])) for name in ("zeta", "gamma")
 }
 """Logarithms of the start values of zeta and gamma, relative to stiffness and inertia at a mode:
@@ -94,14 +98,16 @@ class CoarseResponse:
 
     def __init__(self, comparison: Comparison) -> None:
         sample_count = comparison.angle_rad.size
-        hz = np.fft.rfftfreq(sample_count, 1 / comparison.decimation.rate_hz)
+        all_frequencies_hz = np.fft.rfftfreq(sample_count, 1 / comparison.decimation.rate_hz)
         first_hz, last_hz = comparison.frequency_hz[[0, -1]]
-        band_bins = np.flatnonzero((hz >= first_hz) & (hz <= last_hz))
+        band_bins = np.flatnonzero(
+            (all_frequencies_hz >= first_hz) & (all_frequencies_hz <= last_hz)
+        )
         angle_spectrum = np.fft.rfft(comparison.angle_rad)[band_bins]
         torque_spectrum = np.fft.rfft(comparison.torque_nm)[band_bins]
         # Without excitation the motor moved with the noise: such bins show no response.
-        coherent_angle = np.fft.rfft(comparison.reference_coherent_angle_rad())[band_bins]
-        angle_power = coherent_angle.real**2 + coherent_angle.imag**2
+        coherent_angle_spectrum = np.fft.rfft(comparison.reference_coherent_angle_rad())[band_bins]
+        angle_power = coherent_angle_spectrum.real**2 + coherent_angle_spectrum.imag**2
         is_excited = angle_power > 1e-12 * angle_power.max()
         measured_response, response_weights = (
             torque_spectrum[is_excited] / angle_spectrum[is_excited],
@@ -111,12 +117,14 @@ class CoarseResponse:
             measured_response, response_weights / response_weights.sum(), _COARSE_POINTS
         )
         self._measured = measured_response[selected_bins]
-        self._frequency_hz = hz[band_bins][is_excited][selected_bins]
+        self._frequency_hz = all_frequencies_hz[band_bins][is_excited][selected_bins]
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
         self._responses: dict[Plant, NDArray[np.complex128]] = {}
         self._shifts: dict[Plant, float] = {}
 
-    def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
+    def with_noise_weights(
+        self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]
+    ) -> CoarseResponse:
         """Return the measured response with the weights for another noise spectrum.
 
         `frequency_hz`, shape (K,), are the frequencies of the bins of the noise spectrum.
@@ -129,9 +137,9 @@ class CoarseResponse:
 
     def cost(self, plant: Plant) -> float:
         """Return the weighted mean square of predicted minus measured response, in (N·m/rad)²."""
-        return self._mean_square(self._predicted(plant) - self._measured)
+        return self._mean_square(self._predicted_response(plant) - self._measured)
 
-    def _predicted(self, plant: Plant) -> NDArray[np.complex128]:
+    def _predicted_response(self, plant: Plant) -> NDArray[np.complex128]:
         """Return the predicted response of a plant, from the cache if it has been computed."""
         if plant not in self._responses:
             self._responses[plant] = self._response.evaluate(plant)[0]
@@ -146,31 +154,35 @@ class CoarseResponse:
                 plant.with_parameters(
                     {"density_over_stiffness": factor * ratio, "gamma": factor * gamma}
                 )
-                for factor in np.exp(_LN_RATIO_SHIFTS).tolist()
+                for factor in np.exp(_LN_DENSITY_RATIO_SHIFTS).tolist()
             )
             shift_costs = [
                 self._mean_square(self._response.evaluate(shifted)[0] - self._measured)
                 for shifted in shifted_plants
             ]
-            self._shifts[plant] = float(_LN_RATIO_SHIFTS[int(np.argmin(shift_costs))])
+            self._shifts[plant] = float(_LN_DENSITY_RATIO_SHIFTS[int(np.argmin(shift_costs))])
         return self._shifts[plant]
 
     def distance(self, first_plant: Plant, second_plant: Plant) -> float:
         """Return the weighted mean square of the difference between two plants' responses."""
-        return self._mean_square(self._predicted(first_plant) - self._predicted(second_plant))
+        return self._mean_square(
+            self._predicted_response(first_plant) - self._predicted_response(second_plant)
+        )
 
-    def are_alike(self, first_plant: Plant, second_plant: Plant) -> bool:
+    def are_plants_alike(self, first_plant: Plant, second_plant: Plant) -> bool:
         """Return whether two plants respond so similarly that they count as the same minimum."""
-        return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_FRACTION * min(
+        return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_DISTANCE * min(
             self.cost(first_plant), self.cost(second_plant)
         )
 
-    def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
-        """Return the cost at `x` with its gradient and Gauss-Newton matrix by the unknowns."""
-        plant, unknown_slopes = unknowns.plant_and_gradient(x)
-        spectra = self._response.evaluate(plant, unknowns.gradient_names)
-        response_deviation = spectra[0] - self._measured
-        jacobian = unknown_slopes.T @ spectra[1:]
+    def normal_equations(
+        self, unknowns: Unknowns, vector_of_unknowns: NDArray[np.float64]
+    ) -> NormalEquations:
+        """Return the cost, with its gradient and Gauss-Newton matrix by the unknowns."""
+        plant, unknown_slopes = unknowns.plant_and_gradient(vector_of_unknowns)
+        response_and_gradient = self._response.evaluate(plant, unknowns.gradient_names)
+        response_deviation = response_and_gradient[0] - self._measured
+        jacobian = unknown_slopes.T @ response_and_gradient[1:]
         weighted_jacobian = jacobian.conj() * self._weights
         return NormalEquations(
             cost=self._mean_square(response_deviation),
@@ -183,7 +195,7 @@ class CoarseResponse:
         return float(self._weights @ (response_deviation.real**2 + response_deviation.imag**2))
 
 
-def initial_guesses(
+def start_vectors_for_search(
     coarse_response: CoarseResponse, unknowns: Unknowns
 ) -> list[NDArray[np.float64]]:
     """Return start vectors from which descents reach all relevant minima, each of shape (k,).
@@ -191,13 +203,14 @@ def initial_guesses(
     The first is the best fit with all orders 1, which is close to most materials and to air. The
     others have the same losses with different orders.
     """
-    aligning_shift = resonance_shift(coarse_response, unknowns)
-    damping_sizes = [
-        _START_LN_SIZES.get(parameter_name, (1.0,)) for parameter_name in unknowns.structure.free
+    aligning_shift = unknowns_shift_to_resonances(coarse_response, unknowns)
+    start_values_by_parameter = [
+        _LN_START_COEFFICIENTS.get(parameter_name, (1.0,))
+        for parameter_name in unknowns.structure.free
     ]
     shifted_starts = [
         unknowns.start(np.array(start_vector)) + aligning_shift
-        for start_vector in itertools.product(*damping_sizes)
+        for start_vector in itertools.product(*start_values_by_parameter)
     ]
     best_start = min(shifted_starts, key=lambda x: coarse_response.cost(unknowns.plant(x)))
     start_vectors = [best_start]
@@ -221,12 +234,12 @@ def coarse_minima(
     start_vectors: Iterable[NDArray[np.float64]],
 ) -> list[Minimum]:
     """Return the distinct minima of the coarse cost from some start vectors, the lowest first."""
-    descent_steps = StepRule.for_unknowns(unknowns)
+    step_rule = StepRule.for_unknowns(unknowns)
     minima = [
         descend(
             lambda x: coarse_response.normal_equations(unknowns, x),
             start_vector,
-            descent_steps,
+            step_rule,
             relative_tolerance=_COARSE_COST_TOLERANCE,
             max_evaluations=_MAX_COARSE_EVALUATIONS,
         )
@@ -236,7 +249,7 @@ def coarse_minima(
     for minimum in sorted(minima, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
         if not any(
-            coarse_response.are_alike(plant, unknowns.plant(known_minimum.x))
+            coarse_response.are_plants_alike(plant, unknowns.plant(known_minimum.x))
             for known_minimum in distinct_minima
         ):
             distinct_minima.append(minimum)
@@ -248,13 +261,13 @@ def coarse_minima(
 _RIVAL_COST_TOLERANCE: Final = 1e-2
 """Relative tolerance of the descents that decide which of several minima is lower."""
 
-_MAX_RIVALS: Final = 2
+_MAX_RIVAL_DESCENTS: Final = 2
 """Largest number of coarse minima from which the whole record is fitted."""
 
-_RIVAL_COST_RATIO: Final = 1.5
+_MAX_RIVAL_COST_RATIO: Final = 1.5
 """Cost of a coarse minimum, relative to the lowest one, from which it is ignored."""
 
-_BETTER_COST_RATIO: Final = 0.9
+_MAX_BETTER_COST_RATIO: Final = 0.9
 """Cost of another coarse minimum, relative to that at the end of a descent, below which it is
 refined."""
 
@@ -287,20 +300,23 @@ class Descent:
         return self.objective.unknowns.plant(self.x)
 
     def descend_to_minimum(
-        self, noise: NoiseSpectrum, tolerance: float, hopeless: tuple[int, float] | None = None
+        self,
+        noise: NoiseSpectrum,
+        cost_tolerance: float,
+        give_up_condition: tuple[int, float] | None = None,
     ) -> Descent:
         """Descend to the local minimum under a noise spectrum.
 
-        `tolerance` is relative to the sum of squares. `hopeless` is the number of evaluations and
-        the cost above which `descend` gives up.
+        `cost_tolerance` is relative to the sum of squares. `give_up_condition` is the number of
+        evaluations and the cost above which `descend` gives up.
         """
-        descent_steps = StepRule.for_unknowns(self.objective.unknowns)
+        step_rule = StepRule.for_unknowns(self.objective.unknowns)
         objective, minimum = self.objective.find_minimum(
             self.x,
             noise.weight,
-            descent_steps,
-            relative_tolerance=tolerance,
-            give_up_condition=hopeless,
+            step_rule,
+            relative_tolerance=cost_tolerance,
+            give_up_condition=give_up_condition,
         )
         return Descent(objective, minimum.x, (noise, minimum.cost))
 
@@ -310,7 +326,7 @@ class Descent:
             return self.noise_and_cost[1]
         return self.objective.normal_equations(self.x, noise.weight).cost
 
-    def with_reestimated_angle(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
+    def with_reestimated_angle(self, noise: NoiseSpectrum, cost_tolerance: float) -> Descent:
         """Re-estimate the part of the angle that follows the reference, and descend; repeat both.
 
         Return `self` if this part of the angle has converged already.
@@ -322,7 +338,7 @@ class Descent:
                 break
             descent = Descent(Objective(comparison, descent.objective.unknowns), descent.x)
             noise = descent.noise()
-            descent = descent.descend_to_minimum(noise, tolerance)
+            descent = descent.descend_to_minimum(noise, cost_tolerance)
         return descent
 
     def hum(self) -> tuple[Hum, ...]:
@@ -334,10 +350,12 @@ class Descent:
             1 + len(comparison.later_decay_spectra)
         )
         decay_spectra = self.objective.unknown_torque_spectra(linearisation)[:decay_count]
-        decaying_nm = comparison.to_time_series(torque_amplitudes[:decay_count] @ decay_spectra)
-        return find_hum_near_modes(comparison, self.plant, linearisation.poles, noise, decaying_nm)
+        free_decay_nm = comparison.to_time_series(torque_amplitudes[:decay_count] @ decay_spectra)
+        return find_hum_near_modes(
+            comparison, self.plant, linearisation.poles, noise, free_decay_nm
+        )
 
-    def remove_hum(self, tolerance: float) -> Descent:
+    def remove_hum(self, cost_tolerance: float) -> Descent:
         """Remove the hum near modes from the data, and fit again; return `self` if none exists."""
         descent = self
         for _ in range(_MAX_HUM_SEARCHES):
@@ -348,7 +366,7 @@ class Descent:
                 descent.objective.comparison.remove_hum(hum), descent.objective.unknowns
             )
             descent = Descent(hum_free_objective, descent.x)
-            descent = descent.descend_to_minimum(descent.noise(), tolerance)
+            descent = descent.descend_to_minimum(descent.noise(), cost_tolerance)
         return descent
 
     def noise(self, *, with_lines: bool = False) -> NoiseSpectrum:
@@ -357,12 +375,15 @@ class Descent:
         linearisation = objective.linearise(self.x)
         is_near_mode = None
         if with_lines:
-            hz = comparison.frequency_hz
-            is_near_mode = np.zeros(hz.size, dtype=bool)
+            frequency_hz = comparison.frequency_hz
+            is_near_mode = np.zeros(frequency_hz.size, dtype=bool)
             for mode_pole in linearisation.poles:
-                mode_width_hz = resonance_half_width_hz(mode_pole, float(hz[1] - hz[0]))
+                mode_width_hz = resonance_half_width_hz(
+                    mode_pole, float(frequency_hz[1] - frequency_hz[0])
+                )
                 is_near_mode |= (
-                    np.abs(hz - abs(mode_pole.at_rad_s.imag) / (2 * np.pi)) < mode_width_hz
+                    np.abs(frequency_hz - abs(mode_pole.at_rad_s.imag) / (2 * np.pi))
+                    < mode_width_hz
                 )
         return estimate_noise(
             objective.project(linearisation, 1.0).residual,
@@ -395,9 +416,11 @@ class StructureSearch:
     minima: list[Minimum]
 
     @classmethod
-    def start(cls, objective: Objective, coarse_response: CoarseResponse) -> StructureSearch:
+    def from_objective(
+        cls, objective: Objective, coarse_response: CoarseResponse
+    ) -> StructureSearch:
         """Search the whole range of the unknowns for minima of the coarse response."""
-        start_vectors = initial_guesses(coarse_response, objective.unknowns)
+        start_vectors = start_vectors_for_search(coarse_response, objective.unknowns)
         return cls(
             objective,
             coarse_response,
@@ -427,28 +450,28 @@ class StructureSearch:
         again on the coarse response, which is cheap, and the best few are refined on the whole
         record.
         """
-        whitened_response = self.coarse_response.whitened(
+        whitened_response = self.coarse_response.with_noise_weights(
             noise, self.objective.comparison.frequency_hz
         )
         start_vectors = [minimum.x for minimum in self.minima[:_MAX_STORED_MINIMA]]
-        minima_under_noise = coarse_minima(
+        whitened_minima = coarse_minima(
             whitened_response, self.unknowns, [*start_vectors, self.order_one_start]
         )
         rival_descents = [
             Descent(self.objective, minimum.x)
-            for minimum in minima_under_noise[:_MAX_RIVALS]
-            if minimum.cost < _RIVAL_COST_RATIO * minima_under_noise[0].cost
+            for minimum in whitened_minima[:_MAX_RIVAL_DESCENTS]
+            if minimum.cost < _MAX_RIVAL_COST_RATIO * whitened_minima[0].cost
         ]
         if known_descent is not None:
             known_plant = self.unknowns.plant(known_descent.x)
             rival_descents = [known_descent] + [
                 rival_descent
                 for rival_descent in rival_descents
-                if not whitened_response.are_alike(
+                if not whitened_response.are_plants_alike(
                     known_plant, self.unknowns.plant(rival_descent.x)
                 )
                 and whitened_response.cost(self.unknowns.plant(rival_descent.x))
-                < _BETTER_COST_RATIO * whitened_response.cost(known_plant)
+                < _MAX_BETTER_COST_RATIO * whitened_response.cost(known_plant)
             ]
         if len(rival_descents) == 1:
             return rival_descents[0]
@@ -456,4 +479,4 @@ class StructureSearch:
             rival_descent.descend_to_minimum(noise, _RIVAL_COST_TOLERANCE)
             for rival_descent in rival_descents
         ]
-        return min(final_descents, key=lambda end: end.cost(noise))
+        return min(final_descents, key=lambda final_descent: final_descent.cost(noise))

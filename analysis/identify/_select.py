@@ -85,7 +85,7 @@ ORDER_ONE_STRUCTURE: Final = STRUCTURES["III"]
 """Structure with internal and external damping of order 1. It is fitted from every start: it has no
 local minima by undetermined orders, and no damping that is in fact a stiffness or an inertia."""
 
-_KINDS_AGAINST_IMPACT_SEARCH: Final = frozenset({"sign", "unit", "clipping", "stop"})
+_FINDING_KINDS_AGAINST_IMPACT_SEARCH: Final = frozenset({"sign", "unit", "clipping", "stop"})
 """Findings that make a search for impacts useless. "implausible" is not one of them, since a large
 impact may drive settings to an edge."""
 
@@ -120,7 +120,7 @@ class Selection:
         return self.headline.fit
 
     @property
-    def determined(self) -> frozenset[OrderName]:
+    def determined_orders(self) -> frozenset[OrderName]:
         """Return the damping orders, "alpha" or "lambda", that the record determines precisely."""
         order_verdicts = (self.verdict.alpha, self.verdict.lambda_)
         return frozenset(
@@ -133,7 +133,7 @@ class Selection:
 def select(
     measurement: Measurement,
     *,
-    fixed: Iterable[Setting] = (),
+    fixed_settings: Iterable[Setting] = (),
     band_hz: tuple[float, float] = BAND_HZ,
     earlier: Selection | None = None,
 ) -> Selection:
@@ -150,7 +150,7 @@ def select(
     ----------
     measurement : Measurement
         Angle and torque of the record, with the rig and specimen that the file states.
-    fixed : iterable of str
+    fixed_settings : iterable of str
         Settings that keep the values of the file.
     band_hz : tuple of float
         First and last frequency of the comparison.
@@ -169,11 +169,14 @@ def select(
     MeasurementError
         If the record cannot be used.
     ValueError
-        If a name in `fixed` is no setting.
+        If a name in `fixed_settings` is no setting.
     """
-    fixed = tuple(fixed)
+    fixed_settings = tuple(fixed_settings)
     return _assess_with_impacts(
-        measurement, lambda each: _select_with_known_impacts(each, fixed, band_hz, earlier)
+        measurement,
+        lambda measurement_with_impacts: _select_with_known_impacts(
+            measurement_with_impacts, fixed_settings, band_hz, earlier
+        ),
     ).result
 
 
@@ -191,17 +194,17 @@ class _Assessment(Generic[_ResultT]):
     ----------
     result : _ResultT
         Selection, or the result of `fit_freest_alone`.
-    check : ModelCheck
+    model_check : ModelCheck
         Check of the model against the record.
     """
 
     result: _ResultT
-    check: ModelCheck
+    model_check: ModelCheck
 
     @property
     def residual_is_noise(self) -> bool:
         """Whether the residual is noise only."""
-        return self.check.residual_tests.is_noise
+        return self.model_check.residual_tests.is_noise
 
 
 def _assess_with_impacts(
@@ -214,15 +217,15 @@ def _assess_with_impacts(
     """
     assessment = assess_measurement(measurement)
     for _ in range(MAX_IMPACTS):
-        if assessment.residual_is_noise or not _KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(
-            assessment.check.finding_kinds
+        if assessment.residual_is_noise or not _FINDING_KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(
+            assessment.model_check.finding_kinds
         ):
             break
         better_assessment = None
         # Harmonics last through the whole sweep, but a strong impact may be mistaken for them.
-        candidate_set = assessment.check.candidate_set
+        candidate_set = assessment.model_check.candidate_set
         for impact in find_impacts(
-            candidate_set, only_obvious="harmonics" in assessment.check.finding_kinds
+            candidate_set, only_obvious="harmonics" in assessment.model_check.finding_kinds
         ):
             impact_assessment = assess_measurement(
                 add_known_impact(candidate_set.comparison.measurement, impact)
@@ -239,25 +242,25 @@ def _assess_with_impacts(
 
 def _select_with_known_impacts(
     measurement: Measurement,
-    fixed: tuple[Setting, ...],
+    fixed_settings: tuple[Setting, ...],
     band_hz: tuple[float, float],
-    earlier: Selection | None,
+    earlier_selection: Selection | None,
 ) -> _Assessment[Selection]:
     """Select the structure of a record. The impacts that the measurement states are fitted, too."""
-    earlier_candidates = earlier.linear_candidates if earlier else ()
+    earlier_candidates = earlier_selection.linear_candidates if earlier_selection else ()
     refitted_candidates = (
-        CandidateSet.refit_from_earlier(earlier_candidates, measurement, fixed, band_hz)
+        CandidateSet.refit_from_earlier(earlier_candidates, measurement, fixed_settings, band_hz)
         if earlier_candidates
         else None
     )
     linear_candidates = refitted_candidates or CandidateSet.from_measurement(
-        measurement, fixed, band_hz
+        measurement, fixed_settings, band_hz
     )
     model = fit_linear_model(linear_candidates, band_hz)
     if not (model.explains_record or measurement.impacts):
         for impact in find_impacts(linear_candidates, only_obvious=True):
             impact_assessment = _select_with_known_impacts(
-                add_known_impact(measurement, impact), fixed, band_hz, None
+                add_known_impact(measurement, impact), fixed_settings, band_hz, None
             )
             if impact_assessment.residual_is_noise:
                 return impact_assessment
@@ -266,21 +269,23 @@ def _select_with_known_impacts(
     candidate_set = model.candidate_set.fit_with_free_orders()
     visible_numbers = visible_mode_numbers(candidate_set, modal_fit)
     beam_test = _uniform_beam_test(measurement, modal_fit)
-    uniform_beam_refused = beam_test is not None and beam_test.status == "refused"
+    is_uniform_beam_refused = beam_test is not None and beam_test.status == "refused"
     # A local minimum that a part of the record excludes is excluded by the whole record.
-    determined_orders = earlier.determined if earlier and refitted_candidates else ()
-    should_compute_profiles = (
-        not_reported_reason(candidate_set, visible_numbers) is None and not uniform_beam_refused
+    determined_orders = (
+        earlier_selection.determined_orders if earlier_selection and refitted_candidates else ()
+    )
+    are_profiles_computed = (
+        not_reported_reason(candidate_set, visible_numbers) is None and not is_uniform_beam_refused
     )
     candidate_set, *order_profiles = profile_both_orders(
-        candidate_set, determined_orders, compute=should_compute_profiles
+        candidate_set, determined_orders, compute=are_profiles_computed
     )
     leading_candidates = candidate_set.with_leading_candidate(candidate_set.freest)
-    check = ModelCheck.of_candidates(
+    model_check = ModelCheck.of_candidates(
         leading_candidates, modal_fit, band_hz, model.nonlinear_forces, model.temporal_changes
     )
     alpha_verdict, lambda_verdict = (
-        order_verdict(candidate_set, each, visible_numbers, doubt_reason=check.doubt_reason)
+        order_verdict(candidate_set, each, visible_numbers, doubt_reason=model_check.doubt_reason)
         for each in order_profiles
     )
     order_verdicts = alpha_verdict, lambda_verdict
@@ -288,14 +293,14 @@ def _select_with_known_impacts(
         candidate_set,
         order_verdicts,
         visible_numbers,
-        unexplained_reason=check.model_rejection_reason,
+        unexplained_reason=model_check.model_rejection_reason,
     )
-    if check.doubt_reason is not None:
-        reported_headline = reported_headline.with_flag_on_all(check.doubt_reason)
-    reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
+    if model_check.doubt_reason is not None:
+        reported_headline = reported_headline.with_flag_on_all(model_check.doubt_reason)
+    reported_headline = _add_modal_model(reported_headline, measurement, beam_test, model_check)
     reported_headline = flag_modes_changed_by_drag(reported_headline, model.modes_changed_by_drag)
     effect_findings = model.findings
-    if uniform_beam_refused and check.model_rejection_reason is None:
+    if is_uniform_beam_refused and model_check.model_rejection_reason is None:
         assert modal_fit is not None
         assert beam_test is not None
         causes, cause_findings = _explain_deviations(
@@ -304,40 +309,40 @@ def _select_with_known_impacts(
         effect_findings += cause_findings
         reported_headline = flag_contradicted_damping(reported_headline, causes)
     if reported_headline.tolerant is not None:
-        flags = reported_headline.flags
+        reported_flags = reported_headline.flags
         alpha_verdict, lambda_verdict = (
             order_verdict_with_geometry_tolerance(
                 each.order,
                 reported_headline.tolerant,
                 each,
-                check.doubt_reason or flags.get(each.order),
-                refused=uniform_beam_refused,
+                model_check.doubt_reason or reported_flags.get(each.order),
+                refused=is_uniform_beam_refused,
             )
             for each in order_profiles
         )
         order_verdicts = alpha_verdict, lambda_verdict
-    if "nonlinear stiffness" in check.finding_kinds:
+    if "nonlinear stiffness" in model_check.finding_kinds:
         reported_headline = reported_headline.with_stiffness_law_flag()
-    all_findings = check.reported_findings(
+    all_findings = model_check.reported_findings(
         reported_headline,
         effect_findings,
         tuple(
             temporal_change_findings(
                 model.temporal_changes,
                 is_single_sweep=measurement.is_single_sweep,
-                explained=check.residual_tests.is_noise,
+                explained=model_check.residual_tests.is_noise,
             )
         ),
         model.stiffness_step,
     )
-    close_rivals = rivals(candidate_set, BIC_TIE)
+    close_rival_candidates = rivals(candidate_set, BIC_TIE)
     verdict_sentences, experiment_texts = [], []
-    if not check.contradicts_file:
+    if not model_check.contradicts_file:
         verdict_sentences = headline_sentences(
-            reported_headline, order_verdicts, without_rival=check.doubt_reason is None
+            reported_headline, order_verdicts, without_rival=model_check.doubt_reason is None
         )
         experiment_texts = experiments(
-            candidate_set, order_verdicts, visible_numbers, all_findings, close_rivals
+            candidate_set, order_verdicts, visible_numbers, all_findings, close_rival_candidates
         )
     experiment_texts += [each.remedy for each in all_findings if each.remedy]
     selection = Selection(
@@ -350,25 +355,25 @@ def _select_with_known_impacts(
         verdict=Verdict(
             name=measurement.name,
             structure=candidate_set.best.structure.name,
-            rivals=tuple(c.name for c in close_rivals),
+            rivals=tuple(c.name for c in close_rival_candidates),
             parameters={
                 k: q.value for k, q in reported_headline.parameters.items() if q.flag is None
             },
-            adequate=check.model_rejection_reason is None,
+            adequate=model_check.model_rejection_reason is None,
             alpha=alpha_verdict,
             lambda_=lambda_verdict,
             visible_modes=visible_numbers,
             findings=all_findings,
             table=_candidate_table(candidate_set),
-            whiteness=check.residual_tests.whiteness,
-            input_relation=check.residual_tests.input_relation,
-            harmonics=check.residual_tests.harmonics,
+            whiteness=model_check.residual_tests.whiteness,
+            input_relation=model_check.residual_tests.input_relation,
+            harmonics=model_check.residual_tests.harmonics,
             sentences=(*verdict_sentences, *(each.sentence for each in all_findings)),
             experiments=tuple(dict.fromkeys(experiment_texts)),
             damping_with_amplitude=damping_with_amplitude(leading_candidates),
         ),
     )
-    return _Assessment(selection, check)
+    return _Assessment(selection, model_check)
 
 
 def _uniform_beam_test(
@@ -405,20 +410,20 @@ def _add_modal_model(
     exact_headline: Headline,
     measurement: Measurement,
     beam_test: UniformBeamTest | None,
-    check: ModelCheck,
+    model_check: ModelCheck,
 ) -> Headline:
     """Add the modal model and the estimates with tolerance to the headline for a uniform beam.
 
     Return `exact_headline` if there is no modal model.
     """
-    if check.modal_fit is None or beam_test is None:
+    if model_check.modal_fit is None or beam_test is None:
         return exact_headline
     estimate_with_tolerance = None
     if measurement.axis_tilt_deg:
         exact_headline = exact_headline.with_flag_on_all(TILTED_AXIS_REASON)
     if measurement.uniformity or beam_test.status == "refused" or measurement.axis_tilt_deg:
         estimate_with_tolerance = tolerant_estimate(
-            check.modal_fit,
+            model_check.modal_fit,
             measurement.nominal_plant,
             measurement.uniformity,
             measurement.axis_tilt_deg,
@@ -426,11 +431,11 @@ def _add_modal_model(
         )
     return replace_by_modal_model(
         exact_headline,
-        check.modal_fit,
+        model_check.modal_fit,
         beam_test,
         estimate_with_tolerance,
-        check.doubt_reason,
-        check.mode_doubt_reason,
+        model_check.doubt_reason,
+        model_check.mode_doubt_reason,
     )
 
 
@@ -466,7 +471,10 @@ def fit_freest_alone(
         If the record cannot be used.
     """
     return _assess_with_impacts(
-        measurement, lambda each: _fit_freest_with_known_impacts(each, band_hz)
+        measurement,
+        lambda measurement_with_impacts: _fit_freest_with_known_impacts(
+            measurement_with_impacts, band_hz
+        ),
     ).result
 
 
@@ -485,33 +493,33 @@ def _fit_freest_with_known_impacts(
     if not misread_findings:
         candidate_set = candidate_set.fit_special_cases()
     modal_fit, modes_with_drag = fit_modal_model(candidate_set), None
-    changed_by_drag: tuple[int, ...] = ()
+    modes_changed_by_drag: tuple[int, ...] = ()
     if modal_fit is not None and not measurement.is_single_sweep:
-        modes_with_drag, changed_by_drag = fit_drag_with_modes(
+        modes_with_drag, modes_changed_by_drag = fit_drag_with_modes(
             candidate_set, modal_fit, max_computations=_ONLINE_DRAG_COMPUTATIONS
         )
     if modes_with_drag is not None:
         modal_fit = modes_with_drag.modal_fit
     visible_numbers = visible_mode_numbers(candidate_set, modal_fit)
-    check = ModelCheck.of_candidates(candidate_set, modal_fit, band_hz)
+    model_check = ModelCheck.of_candidates(candidate_set, modal_fit, band_hz)
     reported_headline = headline_of_fit(
         candidate_set.best.name,
         candidate_set.best.fit,
         visible_numbers,
         {} if misread_findings else _unidentifiable_orders(candidate_set, visible_numbers),
-        unexplained_reason=check.model_rejection_reason,
+        unexplained_reason=model_check.model_rejection_reason,
         fit_with_both_dampings=None
         if misread_findings
         else candidate_set.fit_with_both_dampings(candidate_set.best),
     )
     beam_test = _uniform_beam_test(measurement, modal_fit)
-    reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
-    reported_headline = flag_modes_changed_by_drag(reported_headline, changed_by_drag)
-    all_findings = check.reported_findings(
+    reported_headline = _add_modal_model(reported_headline, measurement, beam_test, model_check)
+    reported_headline = flag_modes_changed_by_drag(reported_headline, modes_changed_by_drag)
+    all_findings = model_check.reported_findings(
         reported_headline, () if modes_with_drag is None else (modes_with_drag.finding(),)
     )
-    if check.clipped_torque_reason is not None:
-        reported_headline = reported_headline.with_flag_on_all(check.clipped_torque_reason)
+    if model_check.clipped_torque_reason is not None:
+        reported_headline = reported_headline.with_flag_on_all(model_check.clipped_torque_reason)
     other_fits = (
         candidate.fit
         for candidate in candidate_set.candidates
@@ -520,7 +528,7 @@ def _fit_freest_with_known_impacts(
     record_analysis = RecordAnalysis.from_fits(
         (reported_headline.fit, *other_fits), candidate_set.noise, candidate_set.comparison
     )
-    return _Assessment((reported_headline, all_findings, record_analysis), check)
+    return _Assessment((reported_headline, all_findings, record_analysis), model_check)
 
 
 def _unidentifiable_orders(
@@ -534,12 +542,12 @@ def _unidentifiable_orders(
     common_reason = not_reported_reason(candidate_set, visible_numbers)
     order_reasons = {}
     for order_name in COEFFICIENT_OF.keys() & set(freest_candidate.structure.free):
-        low, upper_end = freest_candidate.fit.interval[order_name] or (-math.inf, math.inf)
-        is_interval_too_wide = upper_end - low > MAX_IDENTIFIABLE_FRACTION * (
+        low, high = freest_candidate.fit.interval[order_name] or (-math.inf, math.inf)
+        is_interval_too_wide = high - low > MAX_IDENTIFIABLE_FRACTION * (
             ORDER_RANGE[1] - ORDER_RANGE[0]
         )
         # A narrow interval without 1, although order 1 fits as well, is that of a local minimum.
-        has_other_minimum = not low <= 1 <= upper_end and any(
+        has_other_minimum = not low <= 1 <= high and any(
             other_candidate.structure.fixed.get(order_name) == 1.0
             and other_candidate.deviance - freest_candidate.deviance < NORMAL_95**2
             for other_candidate in other_candidates

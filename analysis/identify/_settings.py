@@ -22,6 +22,6 @@ SETTINGS: Final[tuple[Setting, ...]] = (
 the age of the torque relative to the angle, and the inertia between torque sensor and beam."""
 
 
-def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
+def free_settings(fixed_settings: Collection[Setting]) -> tuple[Setting, ...]:
     """Return the names of the `SETTINGS` that are not fixed, in the order of `SETTINGS`."""
-    return tuple(setting_name for setting_name in SETTINGS if setting_name not in fixed)
+    return tuple(setting_name for setting_name in SETTINGS if setting_name not in fixed_settings)

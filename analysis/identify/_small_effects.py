@@ -28,22 +28,24 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from rigd.beam import Plant
 
-MIN_DEVIANCE_REDUCTION: Final = 16.0
+MIN_SMALL_EFFECT_DEVIANCE_REDUCTION: Final = 16.0
 """Deviance by which an effect must reduce the residual. By chance one of nine effects does so in
 two records of a thousand."""
 
-LARGE_DEVIANCE_REDUCTION: Final = 100.0
+LARGE_EFFECT_DEVIANCE_REDUCTION: Final = 100.0
 """Reduction of deviance from which the first order may not suffice, so that the effect is searched
 for by its own model."""
 
-_EXACT_KINDS: Final[frozenset[FindingKind]] = frozenset({"nonlinear gain", "friction"})
+_EXACTLY_KNOWN_EFFECT_KINDS: Final[frozenset[FindingKind]] = frozenset(
+    {"nonlinear gain", "friction"}
+)
 """Effects that do not change the motion of the beam, so that the first order is exact."""
 
-_FRICTION_SPEED_RAD_S: Final = 0.01
+_FRICTION_TRANSITION_SPEED_RAD_S: Final = 0.01
 """Motor speed at which 70 % of the dry friction is reached. Its value matters at the turning points
 only."""
 
-_OVERSAMPLING: Final = 4
+_SPEED_OVERSAMPLING: Final = 4
 """Samples of the friction per sample of the angle, since friction has harmonics of the motion."""
 
 
@@ -71,17 +73,17 @@ class SmallEffect:
     @property
     def is_linear(self) -> bool:
         """Return whether the torque by this effect is proportional to the size of the effect."""
-        return self.kind in _EXACT_KINDS
+        return self.kind in _EXACTLY_KNOWN_EFFECT_KINDS
 
     @property
     def is_large(self) -> bool:
         """Return whether the nonlinear effect is so large that it needs a model of its own."""
-        return self.deviance_reduction > LARGE_DEVIANCE_REDUCTION and not self.is_linear
+        return self.deviance_reduction > LARGE_EFFECT_DEVIANCE_REDUCTION and not self.is_linear
 
-    def is_significant_with(self, modal_fit: ModalFit) -> bool:
+    def has_significant_amplitude_in(self, modal_fit: ModalFit) -> bool:
         """Return whether the effect would improve a modal model that contains other effects."""
         [cost_reduction] = modal_fit.cost_reduction_by_spectrum(self.torque_spectrum[None])
-        return bool(cost_reduction >= MIN_DEVIANCE_REDUCTION)
+        return bool(cost_reduction >= MIN_SMALL_EFFECT_DEVIANCE_REDUCTION)
 
     def finding(self) -> Finding:
         """Return the finding that this effect is possible, but not established."""
@@ -96,7 +98,7 @@ class SmallEffect:
         )
 
 
-def small_effect(
+def likeliest_small_effect(
     comparison: Comparison,
     modal_fit: ModalFit,
     plant: Plant,
@@ -115,7 +117,7 @@ def small_effect(
         [torque_spectrum for _, _, torque_spectrum in possible_effects]
     )
     best_index = int(np.argmax(cost_reductions))
-    if cost_reductions[best_index] < MIN_DEVIANCE_REDUCTION:
+    if cost_reductions[best_index] < MIN_SMALL_EFFECT_DEVIANCE_REDUCTION:
         return None
     finding_kind, effect_words, torque_spectrum = possible_effects[best_index]
     return SmallEffect(
@@ -165,14 +167,20 @@ def _friction_spectrum(comparison: Comparison) -> NDArray[np.complex128]:
     angle_rad = comparison.angle_rad
     # The mirrored angle continues without a step at its end.
     mirrored_spectrum = np.fft.rfft(np.concatenate([angle_rad, angle_rad[::-1]]))
-    fine_angle_rad = _OVERSAMPLING * np.fft.irfft(
-        mirrored_spectrum, 2 * _OVERSAMPLING * angle_rad.size
+    fine_angle_rad = _SPEED_OVERSAMPLING * np.fft.irfft(
+        mirrored_spectrum, 2 * _SPEED_OVERSAMPLING * angle_rad.size
     )
-    speed_rad_s = np.gradient(fine_angle_rad) * (_OVERSAMPLING * comparison.decimation.rate_hz)
-    retained = slice(
-        _OVERSAMPLING * comparison.retained_samples.start,
-        _OVERSAMPLING * comparison.retained_samples.stop,
+    speed_rad_s = np.gradient(fine_angle_rad) * (
+        _SPEED_OVERSAMPLING * comparison.decimation.rate_hz
     )
-    friction_torque = (speed_rad_s / np.hypot(speed_rad_s, _FRICTION_SPEED_RAD_S))[retained]
-    friction_spectrum: NDArray[np.complex128] = comparison.spectrum(friction_torque) / _OVERSAMPLING
+    retained_fine_samples = slice(
+        _SPEED_OVERSAMPLING * comparison.retained_samples.start,
+        _SPEED_OVERSAMPLING * comparison.retained_samples.stop,
+    )
+    friction_torque = (speed_rad_s / np.hypot(speed_rad_s, _FRICTION_TRANSITION_SPEED_RAD_S))[
+        retained_fine_samples
+    ]
+    friction_spectrum: NDArray[np.complex128] = (
+        comparison.spectrum(friction_torque) / _SPEED_OVERSAMPLING
+    )
     return friction_spectrum

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
     from analysis.identify._modal_fit import ModalFit
 
-MIN_REPORTED_SCORE: Final = 20.0
+MIN_REPORTED_DEVIANCE_REDUCTION: Final = 20.0
 """Reduction of deviance from which a step is reported. Records without a step stay below 13 or
 so."""
 
-_COARSE_INSTANTS: Final = 80
+_COARSE_INSTANT_COUNT: Final = 80
 """Number of instants tried along the whole record."""
 
-_FINE_INSTANTS_PER_SIDE: Final = 3
+_FINE_INSTANT_COUNT_PER_SIDE: Final = 3
 """Number of instants tried to either side of the best one."""
 
 
@@ -53,8 +53,8 @@ class StiffnessStep:
 
     @property
     def is_significant(self) -> bool:
-        """Return whether the step is significant: its score is above `MIN_REPORTED_SCORE`."""
-        return self.score > MIN_REPORTED_SCORE
+        """Return whether the score is above `MIN_REPORTED_DEVIANCE_REDUCTION`."""
+        return self.score > MIN_REPORTED_DEVIANCE_REDUCTION
 
     @property
     def text(self) -> str:
@@ -75,36 +75,38 @@ class StiffnessStep:
         }
 
 
-def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
+def best_stiffness_step(comparison: Comparison, modal_fit: ModalFit) -> StiffnessStep:
     """Return the stiffness step that best explains the residual of the modal model."""
-    real_residual = fit.residual.view(np.float64)
-    step_torque = _StiffnessStepTorque(comparison, fit)
+    real_residual = modal_fit.residual.view(np.float64)
+    step_torque = _StiffnessStepTorque(comparison, modal_fit)
     best_step, sample_indices = (
         StiffnessStep(0.0, 0.0, 0.0),
-        np.linspace(0, comparison.sample_count, _COARSE_INSTANTS + 2)[1:-1],
+        np.linspace(0, comparison.sample_count, _COARSE_INSTANT_COUNT + 2)[1:-1],
     )
     instant_spacing = float(sample_indices[1] - sample_indices[0])
     for _ in range(2):
         step_spectra = np.array(
             [step_torque.spectrum(int(sample_index)) for sample_index in sample_indices]
         )
-        whitened_spectra = np.ascontiguousarray(step_spectra * fit.noise.weight).view(np.float64)
-        whitened_spectra = fit.part_outside_span(whitened_spectra)
-        spectrum_squares = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
-        spectrum_squares[spectrum_squares == 0] = np.inf
+        whitened_spectra = np.ascontiguousarray(step_spectra * modal_fit.noise.weight).view(
+            np.float64
+        )
+        whitened_spectra = modal_fit.part_outside_span(whitened_spectra)
+        squared_spectrum_norms = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
+        squared_spectrum_norms[squared_spectrum_norms == 0] = np.inf
         correlation = -(whitened_spectra @ real_residual)  # the residual is model less measurement
-        deviance_reductions = correlation**2 / spectrum_squares
+        deviance_reductions = correlation**2 / squared_spectrum_norms
         best_index = int(np.argmax(deviance_reductions))
         if deviance_reductions[best_index] > best_step.score:
             best_step = StiffnessStep(
                 score=float(deviance_reductions[best_index]),
                 instant_s=comparison.first_sample_s
                 + float(sample_indices[best_index]) / comparison.decimation.rate_hz,
-                relative_change=float(correlation[best_index] / spectrum_squares[best_index]),
+                relative_change=float(correlation[best_index] / squared_spectrum_norms[best_index]),
             )
         sample_indices = (
             sample_indices[best_index]
-            + instant_spacing * np.linspace(-1, 1, 2 * _FINE_INSTANTS_PER_SIDE + 3)[1:-1]
+            + instant_spacing * np.linspace(-1, 1, 2 * _FINE_INSTANT_COUNT_PER_SIDE + 3)[1:-1]
         )
         sample_indices = sample_indices[
             (sample_indices > 0) & (sample_indices < comparison.sample_count)
@@ -115,7 +117,7 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
 class _StiffnessStepTorque:
     """Computation of the torque change if the stiffness of the modal model rises at an instant."""
 
-    def __init__(self, comparison: Comparison, fit: ModalFit) -> None:
+    def __init__(self, comparison: Comparison, modal_fit: ModalFit) -> None:
         self._comparison = comparison
         sample_count = comparison.angle_rad.size
         self._transform = CausalTransform.for_record(sample_count, comparison.decimation.rate_hz)
@@ -123,7 +125,10 @@ class _StiffnessStepTorque:
         angle_transform = self._transform.forward(comparison.angle_rad)
         mode_vibrations, torque_per_force = [], []
         for mode_index, pole, residue in zip(
-            fit.mode_numbers, fit.model.poles_rad_s, fit.model.residues, strict=True
+            modal_fit.mode_numbers,
+            modal_fit.model.poles_rad_s,
+            modal_fit.model.residues,
+            strict=True,
         ):
             if mode_index:
                 # The mode adds inertia s⁴ / (s² + 2 xi omega s + omega²) to G, without constants.

@@ -38,7 +38,7 @@ _ROUGH_COST_TOLERANCE: Final = 1e-3
 """Relative tolerance of the cost in the descents from several starts."""
 _COST_TOLERANCE: Final = 1e-8
 """Relative tolerance of the cost at the minimum."""
-_MAX_DESCENTS: Final = 3
+_MAX_FINE_DESCENTS: Final = 3
 """Maximum number of starts, those of the lowest cost, from which descents begin."""
 _MAX_EVALUATIONS: Final = 60
 """Largest number of evaluations of a descent."""
@@ -91,23 +91,23 @@ class StructureFit:
     @property
     def sentence(self) -> str:
         """Return the sentence that compares this structure with types I to VII by BIC."""
-        above = self.delta_bic > 0
-        difference = (
-            f"its BIC is {abs(self.delta_bic):.3g} {'above' if above else 'below'} that of type "
+        is_above = self.delta_bic > 0
+        bic_text = (
+            f"its BIC is {abs(self.delta_bic):.3g} {'above' if is_above else 'below'} that of type "
             f"{self.compared_with}"
         )
-        meaning = "the record supports it less" if above else "the record supports it more"
+        meaning_text = "the record supports it less" if is_above else "the record supports it more"
         if abs(self.delta_bic) < BIC_DECISIVE:
-            meaning = "the record does not distinguish the two"
+            meaning_text = "the record does not distinguish the two"
         return (
             f"Structure {self.structure.name} of {self.package} "
             f"({self.structure.description[:1].lower()}{self.structure.description[1:]}): "
-            f"{difference}, so {meaning}. The reported numbers are those of types I to VII."
+            f"{bic_text}, so {meaning_text}. The reported numbers are those of types I to VII."
         )
 
 
 def fit_structure(
-    added_structure: AddedStructure, selection: Selection, fixed: tuple[Setting, ...] = ()
+    added_structure: AddedStructure, selection: Selection, fixed_settings: tuple[Setting, ...] = ()
 ) -> StructureFit | None:
     """Fit the damping structure of a package to the record of a selection.
 
@@ -120,7 +120,7 @@ def fit_structure(
         Structure and its package.
     selection : Selection
         Selection among types I to VII, with data and noise spectrum of the record.
-    fixed : tuple of str
+    fixed_settings : tuple of str
         Settings that stay at the values the file states.
 
     Raises
@@ -129,45 +129,56 @@ def fit_structure(
         If the code of the package fails, or its damping is not finite somewhere in its range.
     """
     structure, plugin = added_structure.structure, added_structure.plugin
-    best = selection.candidates[0]
-    if best.nonlinear_effect_count or selection.analysis.comparison.drag is not None:
+    best_candidate = selection.candidates[0]
+    if best_candidate.nonlinear_effect_count or selection.analysis.comparison.drag is not None:
         return None
     noise = selection.analysis.noise
     comparison = selection.analysis.comparison
     undamped_unknowns = Unknowns.for_structure(
-        UNDAMPED, comparison.measurement.nominal_plant, free_settings(fixed)
+        UNDAMPED, comparison.measurement.nominal_plant, free_settings(fixed_settings)
     )
     unknowns = StructureUnknowns(
         structure,
         undamped_unknowns.nominal,
         undamped_unknowns.free_settings,
         undamped_unknowns.omega_rad_s,
-        comparison.poles(best.fit.plant),
+        comparison.poles(best_candidate.fit.plant),
     )
     region = ConstantBounds(*unknowns.bounds)
     with plugin_errors(plugin):
         try:
             objective = Objective(comparison, unknowns)
-            starts = [unknowns.vector_near(v, best.fit.plant) for v in structure.start_values()]
-            if len(starts) > _MAX_DESCENTS:
-                starts.sort(key=lambda x: objective.normal_equations(x, noise.weight).cost)
-            descents = [
+            start_vectors = [
+                unknowns.vector_near(v, best_candidate.fit.plant) for v in structure.start_values()
+            ]
+            if len(start_vectors) > _MAX_FINE_DESCENTS:
+                start_vectors.sort(
+                    key=lambda vector_of_unknowns: (
+                        objective.normal_equations(vector_of_unknowns, noise.weight).cost
+                    )
+                )
+            objectives_and_minima = [
                 objective.find_minimum(
-                    start,
+                    start_vector,
                     noise.weight,
                     region,
                     relative_tolerance=_ROUGH_COST_TOLERANCE,
                     max_evaluations=_MAX_EVALUATIONS,
                 )
-                for start in starts[:_MAX_DESCENTS]
+                for start_vector in start_vectors[:_MAX_FINE_DESCENTS]
             ]
-            objective, rough_minimum = min(descents, key=lambda each: each[1].cost)
+            objective, rough_minimum = min(
+                objectives_and_minima,
+                key=lambda objective_and_minimum: objective_and_minimum[1].cost,
+            )
             objective, minimum = objective.find_minimum(
                 rough_minimum.x, noise.weight, region, relative_tolerance=_COST_TOLERANCE
             )
-            x = minimum.x
-            projected_residual = objective.project(objective.linearise(x), noise.weight)
-            plant, slopes = unknowns.plant_and_gradient(x)
+            vector_of_unknowns = minimum.x
+            projected_residual = objective.project(
+                objective.linearise(vector_of_unknowns), noise.weight
+            )
+            plant, slopes = unknowns.plant_and_gradient(vector_of_unknowns)
             loss_factors = tuple(
                 (pole.frequency_hz, plant.loss_factor(abs(pole.at_rad_s)))
                 for pole in unknowns.decay_poles
@@ -175,14 +186,18 @@ def fit_structure(
             )
         except ValueError as error:
             raise plugin.error(str(error)) from error
-    degrees_of_freedom = best.compared_value_count - x.size - best.fit.ringing.degrees_of_freedom
-    at_bound = (x <= region.lower) | (x >= region.upper)
+    degrees_of_freedom = (
+        best_candidate.compared_value_count
+        - vector_of_unknowns.size
+        - best_candidate.fit.ringing.degrees_of_freedom
+    )
+    at_bound = (vector_of_unknowns <= region.lower) | (vector_of_unknowns >= region.upper)
     covariance, determined = covariance_of_unknowns(
         projected_residual.jacobian, projected_residual.cost / degrees_of_freedom, at_bound
     )
-    stds = np.sqrt(np.diag(slopes @ covariance @ slopes.T))
-    parameters = unknowns.parameters(x)
-    names = unknowns.names
+    parameter_stds = np.sqrt(np.diag(slopes @ covariance @ slopes.T))
+    parameters = unknowns.parameters(vector_of_unknowns)
+    parameter_names = unknowns.names
     return StructureFit(
         structure=structure,
         package=plugin.label,
@@ -191,15 +206,18 @@ def fit_structure(
             name: (float(std) * (parameters[name] if name in LOGARITHMIC_PARAMETERS else 1.0))
             if is_determined
             else None
-            for name, std, is_determined in zip(names, stds, determined, strict=True)
+            for name, std, is_determined in zip(
+                parameter_names, parameter_stds, determined, strict=True
+            )
         },
         at_bounds=tuple(
-            name for name, is_at_bound in zip(names, at_bound, strict=True) if is_at_bound
+            name for name, is_at_bound in zip(parameter_names, at_bound, strict=True) if is_at_bound
         ),
         loss_factors=loss_factors,
         cost=minimum.cost,
         degrees_of_freedom=degrees_of_freedom,
-        delta_bic=bic(minimum.cost, best.compared_value_count, x.size) - best.bic,
-        compared_with=best.name,
+        delta_bic=bic(minimum.cost, best_candidate.compared_value_count, vector_of_unknowns.size)
+        - best_candidate.bic,
+        compared_with=best_candidate.name,
         residual=projected_residual.residual,
     )

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from analysis.models import Structure
     from rigd.beam import Parameter, Pole
 
-_PARAMETER_STEP: Final = 1e-5
+_PARAMETER_DIFFERENCE_STEP: Final = 1e-5
 """Step of central differences by a parameter, relative to its value or to its range."""
-_UNKNOWN_STEP: Final = 1e-6
+_UNKNOWN_DIFFERENCE_STEP: Final = 1e-6
 """Step of central differences by an unknown."""
-_PLANT_FIELDS: Final = tuple(each.name for each in fields(Plant))
+_PLANT_FIELD_NAMES: Final = tuple(each.name for each in fields(Plant))
 """Names of the fields of a plant, in their order."""
 
 
@@ -35,7 +35,7 @@ class StructurePlant(Plant):
 
     structure: Structure = UNDAMPED
     """Damping structure."""
-    values: Mapping[str, float] = field(default_factory=dict)
+    parameter_values: Mapping[str, float] = field(default_factory=dict)
     """Values of the structure's parameters."""
     decay_poles: tuple[Pole, ...] = ()
     """Poles of the free decay at the start of the record, which no parameter moves."""
@@ -44,7 +44,7 @@ class StructurePlant(Plant):
         self, s: NDArray[np.complex128]
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Return the elastic factor c and the inertial factor p at `s` (rad/s)."""
-        elastic, external = self.structure.finite_factors(s, self.values)
+        elastic, external = self.structure.finite_factors(s, self.parameter_values)
         return elastic, self.beam.density_over_stiffness * s * s + external
 
     def torque_spectra(
@@ -60,25 +60,31 @@ class StructurePlant(Plant):
         `gradient_name` has them.
         """
         s_squared = s * s
-        at = self.rigid_clamp_response(s)
-        clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
-        torque = at.response * clamp_factor + self.tool_inertia_kg_m2 * s_squared
-        by_density = at.slope_by_inertial_factor * self.beam.density_over_stiffness * s_squared
+        clamp_response = self.rigid_clamp_response(s)
+        clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * clamp_response.response)
+        torque_response = (
+            clamp_response.response * clamp_factor + self.tool_inertia_kg_m2 * s_squared
+        )
+        density_derivative = (
+            clamp_response.slope_by_inertial_factor * self.beam.density_over_stiffness * s_squared
+        )
         derivatives = {
-            "ln_density_over_stiffness": by_density * clamp_factor**2,
-            "ln_stiffness": at.response * clamp_factor**2,
-            "delay_s": -s * torque,
+            "ln_density_over_stiffness": density_derivative * clamp_factor**2,
+            "ln_stiffness": clamp_response.response * clamp_factor**2,
+            "delay_s": -s * torque_response,
             "tool_inertia_kg_m2": s_squared,
         }
         for parameter in self.structure.parameters:
             if parameter.name in gradient_parameters:
                 by_elastic, by_external = self._factor_slopes(s, parameter)
                 derivatives[parameter.name] = (
-                    at.slope_by_elastic_factor * by_elastic
-                    + at.slope_by_inertial_factor * by_external
+                    clamp_response.slope_by_elastic_factor * by_elastic
+                    + clamp_response.slope_by_inertial_factor * by_external
                 ) * clamp_factor**2
-        rows = np.stack([torque, *(derivatives[name] for name in gradient_parameters)])
-        return rows * (self.channel_response(s) * angle_spectrum)
+        response_and_derivatives = np.stack(
+            [torque_response, *(derivatives[name] for name in gradient_parameters)]
+        )
+        return response_and_derivatives * (self.channel_response(s) * angle_spectrum)
 
     def _factor_slopes(
         self, s: NDArray[np.complex128], parameter: Parameter
@@ -87,13 +93,16 @@ class StructurePlant(Plant):
 
         They are central differences.
         """
-        value = self.values[parameter.name]
-        step = _PARAMETER_STEP * (
-            value if parameter.logarithmic else parameter.upper - parameter.lower
+        parameter_value = self.parameter_values[parameter.name]
+        difference_step = _PARAMETER_DIFFERENCE_STEP * (
+            parameter_value if parameter.logarithmic else parameter.upper - parameter.lower
         )
-        low, high = max(value - step, parameter.lower), min(value + step, parameter.upper)
+        low, high = (
+            max(parameter_value - difference_step, parameter.lower),
+            min(parameter_value + difference_step, parameter.upper),
+        )
         below, above = (
-            self.structure.finite_factors(s, {**self.values, parameter.name: at})
+            self.structure.finite_factors(s, {**self.parameter_values, parameter.name: at})
             for at in (low, high)
         )
         return (above[0] - below[0]) / (high - low), (above[1] - below[1]) / (high - low)
@@ -111,9 +120,9 @@ class StructurePlant(Plant):
     def loss_factor(self, omega_rad_s: float) -> float:
         """Return the loss factor of the damping at an angular frequency."""
         s = np.array([1j * omega_rad_s])
-        (elastic,), (external,) = self.structure.finite_factors(s, self.values)
-        inertia = self.beam.density_over_stiffness * omega_rad_s**2
-        return float(elastic.imag / elastic.real + external.imag / (inertia - external.real))
+        (elastic,), (external,) = self.structure.finite_factors(s, self.parameter_values)
+        inertial_term = self.beam.density_over_stiffness * omega_rad_s**2
+        return float(elastic.imag / elastic.real + external.imag / (inertial_term - external.real))
 
 
 @dataclass(frozen=True)
@@ -137,7 +146,11 @@ class StructureUnknowns(Unknowns):
     @property
     def _free_parameters(self) -> list[Parameter]:
         """Return the free parameters of the structure."""
-        return [each for each in self.structure.parameters if each.name in self.structure.free]
+        return [
+            parameter
+            for parameter in self.structure.parameters
+            if parameter.name in self.structure.free
+        ]
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -145,59 +158,82 @@ class StructureUnknowns(Unknowns):
         lower, upper = self.setting_unknowns.bounds
         return (
             np.array(
-                [*(_unknown_of_value(each, each.lower) for each in self._free_parameters), *lower]
+                [
+                    *(
+                        _unknown_of_value(parameter, parameter.lower)
+                        for parameter in self._free_parameters
+                    ),
+                    *lower,
+                ]
             ),
             np.array(
-                [*(_unknown_of_value(each, each.upper) for each in self._free_parameters), *upper]
+                [
+                    *(
+                        _unknown_of_value(parameter, parameter.upper)
+                        for parameter in self._free_parameters
+                    ),
+                    *upper,
+                ]
             ),
         )
 
-    def vector_near(self, values: Mapping[str, float], closest: Plant) -> NDArray[np.float64]:
-        """Return the unknowns for values of the structure's parameters, with `closest` as beam."""
+    def vector_near(
+        self, parameter_values: Mapping[str, float], closest_plant: Plant
+    ) -> NDArray[np.float64]:
+        """Return the unknowns for values of the structure's parameters, near `closest_plant`."""
         own_unknowns = [
-            _unknown_of_value(each, values[each.name]) for each in self._free_parameters
+            _unknown_of_value(parameter, parameter_values[parameter.name])
+            for parameter in self._free_parameters
         ]
-        return np.array([*own_unknowns, *self.setting_unknowns.vector(closest)])
+        return np.array([*own_unknowns, *self.setting_unknowns.vector(closest_plant)])
 
-    def values(self, x: NDArray[np.float64]) -> dict[str, float]:
+    def parameter_values(self, vector_of_unknowns: NDArray[np.float64]) -> dict[str, float]:
         """Return the values of the structure's parameters for a vector of unknowns."""
         own_values = {
-            each.name: _value_of_unknown(each, float(unknown))
-            for each, unknown in zip(self._free_parameters, x, strict=False)
+            parameter.name: _value_of_unknown(parameter, float(unknown))
+            for parameter, unknown in zip(self._free_parameters, vector_of_unknowns, strict=False)
         }
         return {**self.structure.fixed, **own_values}
 
-    def plant(self, x: NDArray[np.float64]) -> StructurePlant:
+    def plant(self, vector_of_unknowns: NDArray[np.float64]) -> StructurePlant:
         """Return the plant that a vector of unknowns describes."""
-        values, plant = self.values(x), self.setting_unknowns.plant(x[len(self.structure.free) :])
+        parameter_values, plant = (
+            self.parameter_values(vector_of_unknowns),
+            self.setting_unknowns.plant(vector_of_unknowns[len(self.structure.free) :]),
+        )
         first_rad_s, second_rad_s = self.setting_unknowns.omega_rad_s
         s = np.array([1j * first_rad_s, 1j * second_rad_s])
-        elastic, external = self.structure.finite_factors(s, values)
+        elastic, external = self.structure.finite_factors(s, parameter_values)
         density_over_stiffness = plant.beam.density_over_stiffness
-        stiffening = abs(elastic[1])
-        inertia_change = abs(1 + external[0] / (density_over_stiffness * s[0] ** 2))
-        effective: dict[str, float] = {
-            "density_over_stiffness": density_over_stiffness * stiffening / inertia_change,
-            "bending_stiffness_n_m2": plant.beam.bending_stiffness_n_m2 / stiffening,
+        stiffening_factor = abs(elastic[1])
+        inertia_factor = abs(1 + external[0] / (density_over_stiffness * s[0] ** 2))
+        effective_beam_parameters: dict[str, float] = {
+            "density_over_stiffness": density_over_stiffness * stiffening_factor / inertia_factor,
+            "bending_stiffness_n_m2": plant.beam.bending_stiffness_n_m2 / stiffening_factor,
         }
-        changes: dict[str, float] = {
-            name: effective[name] for name in BEAM_PARAMETERS if name in self.free_settings
+        changed_parameters: dict[str, float] = {
+            name: effective_beam_parameters[name]
+            for name in BEAM_PARAMETERS
+            if name in self.free_settings
         }
-        plant = plant.with_parameters(changes)
+        plant = plant.with_parameters(changed_parameters)
         return StructurePlant(
-            **{name: getattr(plant, name) for name in _PLANT_FIELDS},
+            **{name: getattr(plant, name) for name in _PLANT_FIELD_NAMES},
             structure=self.structure,
-            values=values,
+            parameter_values=parameter_values,
             decay_poles=self.decay_poles,
         )
 
-    def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
+    def parameters(self, vector_of_unknowns: NDArray[np.float64]) -> dict[str, float]:
         """Return the values of structure and settings by name, for a vector of unknowns."""
-        plant = self.plant(x)
-        return {**plant.values, **{name: float(plant.parameters[name]) for name in SETTINGS}}
+        plant = self.plant(vector_of_unknowns)
+        return {
+            **plant.parameter_values,
+            **{name: float(plant.parameters[name]) for name in SETTINGS},
+        }
 
     def plant_and_gradient(
-        self, x: NDArray[np.float64]
+        self, vector_of_unknowns: NDArray[np.float64]
     ) -> tuple[StructurePlant, NDArray[np.float64]]:
         """Return the plant for a vector of unknowns, and the derivatives of its parameters.
 
@@ -205,45 +241,55 @@ class StructureUnknowns(Unknowns):
         `gradient_names`.
         """
         lower, upper = self.bounds
-        slopes = np.empty((x.size, x.size))
-        for index in range(x.size):
-            ends = np.clip(
-                x[index] + np.array([-_UNKNOWN_STEP, _UNKNOWN_STEP]), lower[index], upper[index]
+        parameter_slopes = np.empty((vector_of_unknowns.size, vector_of_unknowns.size))
+        for index in range(vector_of_unknowns.size):
+            interval_ends = np.clip(
+                vector_of_unknowns[index]
+                + np.array([-_UNKNOWN_DIFFERENCE_STEP, _UNKNOWN_DIFFERENCE_STEP]),
+                lower[index],
+                upper[index],
             )
-            below, above = (self._gradient_values(_with_value(x, index, end)) for end in ends)
-            slopes[:, index] = (above - below) / (ends[1] - ends[0])
-        return self.plant(x), slopes
+            below, above = (
+                self._gradient_values(_with_element_changed(vector_of_unknowns, index, end))
+                for end in interval_ends
+            )
+            parameter_slopes[:, index] = (above - below) / (interval_ends[1] - interval_ends[0])
+        return self.plant(vector_of_unknowns), parameter_slopes
 
-    def _gradient_values(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _gradient_values(self, vector_of_unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the values of the parameters by which the response is differentiated."""
-        values = self.parameters(x)
+        parameter_values = self.parameters(vector_of_unknowns)
         return np.array(
             [
-                np.log(values[name]) if gradient.startswith("ln_") else values[name]
+                np.log(parameter_values[name])
+                if gradient.startswith("ln_")
+                else parameter_values[name]
                 for name, gradient in zip(self.names, self.gradient_names, strict=True)
             ]
         )
 
 
-def _unknown_of_value(parameter: Parameter, value: float) -> float:
+def _unknown_of_value(parameter: Parameter, parameter_value: float) -> float:
     """Return the unknown for the value of a structure's parameter."""
     if parameter.logarithmic:
-        return float(np.log(value))
-    return (value - parameter.lower) / (parameter.upper - parameter.lower)
+        return float(np.log(parameter_value))
+    return (parameter_value - parameter.lower) / (parameter.upper - parameter.lower)
 
 
-def _value_of_unknown(parameter: Parameter, unknown: float) -> float:
+def _value_of_unknown(parameter: Parameter, unknown_value: float) -> float:
     """Return the value of a structure's parameter for its unknown."""
-    value = (
-        float(np.exp(unknown))
+    parameter_value = (
+        float(np.exp(unknown_value))
         if parameter.logarithmic
-        else parameter.lower + unknown * (parameter.upper - parameter.lower)
+        else parameter.lower + unknown_value * (parameter.upper - parameter.lower)
     )
-    return min(max(value, parameter.lower), parameter.upper)
+    return min(max(parameter_value, parameter.lower), parameter.upper)
 
 
-def _with_value(x: NDArray[np.float64], index: int, value: float) -> NDArray[np.float64]:
+def _with_element_changed(
+    vector: NDArray[np.float64], index: int, value: float
+) -> NDArray[np.float64]:
     """Return a copy of a vector with another value at one index."""
-    changed = x.copy()
-    changed[index] = value
-    return changed
+    changed_vector = vector.copy()
+    changed_vector[index] = value
+    return changed_vector

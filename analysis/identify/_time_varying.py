@@ -50,10 +50,10 @@ if TYPE_CHECKING:
 
 # Search for changes along the record
 
-Effect = Literal["damping", "stiffness", "gain", "clock", "play"]
+ChangingProperty = Literal["damping", "stiffness", "gain", "clock", "play"]
 """Property that changes along the record, or "play" for backlash."""
 
-_STRUCTURES_TO_TEST: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
+_TESTED_STRUCTURES: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
 """Structures that are tested with a change along the record, in addition to the best one."""
 
 _GRADIENT_PARAMETERS: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
@@ -75,19 +75,22 @@ advantage that a fit shows."""
 UNIT_BACKLASH_RAD: Final = 1e-4
 """Backlash that corresponds to 1 of the fitted size, in rad."""
 
-_CLOCK_UNIT: Final = 1e-5
+_CLOCK_RATE_UNIT: Final = 1e-5
 """Relative difference of the clock rates that corresponds to 1 of the fitted size."""
 
-_SIZE_UNITS: Final[Mapping[Effect, float]] = {"play": UNIT_BACKLASH_RAD, "clock": _CLOCK_UNIT}
+_CHANGE_SIZE_UNITS: Final[Mapping[ChangingProperty, float]] = {
+    "play": UNIT_BACKLASH_RAD,
+    "clock": _CLOCK_RATE_UNIT,
+}
 """Value that corresponds to 1 of the fitted size, by effect. It is 1 for the other effects."""
 
-_TAYLOR_TERMS: Final = 16
+_CLOCK_TAYLOR_TERM_COUNT: Final = 16
 """Number of terms of the Taylor series in time: enough for three radians."""
 
-_MAX_SIZE_FITS: Final = 8
+_MAX_CHANGE_SIZE_FITS: Final = 8
 """Largest number of fits. After each, the torque spectrum is recomputed for the fitted size."""
 
-_RELATIVE_SIZE_TOLERANCE: Final = 0.01
+_RELATIVE_CHANGE_SIZE_TOLERANCE: Final = 0.01
 """Relative change of the fitted size at which the repeated fits end."""
 
 
@@ -106,7 +109,7 @@ class TemporalChange:
         BIC with this effect minus the lowest BIC without it.
     """
 
-    effect: Effect
+    effect: ChangingProperty
     size: float
     std: float
     bic_difference: float
@@ -134,13 +137,13 @@ def find_temporal_changes(
     if candidate_set.misread_findings:
         return candidate_set, ()
     backlash_angle = _backlash_angle(candidate_set.comparison)
-    highest_bic = candidate_set.best.bic + min(
+    highest_tested_bic = candidate_set.best.bic + min(
         BIC_DECISIVE, _RIVAL_BIC_FRACTION * (rival_bic - candidate_set.bic)
     )
-    fitted_changes: dict[Effect, tuple[float, Refit]] = {}
+    fitted_changes: dict[ChangingProperty, tuple[float, Refit]] = {}
     for candidate in _candidates_to_test(candidate_set):
         for changing_property, predicted_bic in _promising_changes(
-            candidate_set, candidate, backlash_angle, highest_bic
+            candidate_set, candidate, backlash_angle, highest_tested_bic
         ):
             if predicted_bic < min(
                 fitted_changes.get(changing_property, (math.inf,))[0],
@@ -154,7 +157,7 @@ def find_temporal_changes(
     possible_changes = []
     for changing_property, (bic, best_refit) in fitted_changes.items():
         size_factors, std = best_refit.amplitudes()
-        size_unit = _SIZE_UNITS.get(changing_property, 1.0)
+        size_unit = _CHANGE_SIZE_UNITS.get(changing_property, 1.0)
         temporal_change = TemporalChange(
             changing_property,
             size_unit * float(size_factors[-1]),
@@ -163,7 +166,7 @@ def find_temporal_changes(
         )
         if temporal_change.bic_difference < BIC_DECISIVE and _has_possible_size(temporal_change):
             possible_changes.append((temporal_change, best_refit))
-    possible_changes.sort(key=lambda pair: pair[0].bic_difference)
+    possible_changes.sort(key=lambda change_and_refit: change_and_refit[0].bic_difference)
     if not possible_changes:
         return candidate_set, ()
     best_change, best_refit = possible_changes[0]
@@ -180,14 +183,14 @@ def find_temporal_changes(
 
 
 def _highest_predicted_bic(
-    candidate_set: CandidateSet, fitted_changes: Mapping[Effect, tuple[float, Refit]]
+    candidate_set: CandidateSet, fitted_changes: Mapping[ChangingProperty, tuple[float, Refit]]
 ) -> float:
     """Return the predicted BIC above which no change would rival the best of the fitted ones."""
     lowest_bic = min((bic for bic, _ in fitted_changes.values()), default=math.inf)
-    needed_advantage = candidate_set.best.bic - lowest_bic - BIC_DECISIVE
-    if needed_advantage <= 0:
+    required_bic_reduction = candidate_set.best.bic - lowest_bic - BIC_DECISIVE
+    if required_bic_reduction <= 0:
         return math.inf
-    return candidate_set.best.bic - _PREDICTED_BIC_FRACTION * needed_advantage
+    return candidate_set.best.bic - _PREDICTED_BIC_FRACTION * required_bic_reduction
 
 
 def _has_possible_size(temporal_change: TemporalChange) -> bool:
@@ -209,7 +212,7 @@ def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
     """
     yield candidate_set.best
     for candidate in candidate_set.candidates[1:]:
-        if candidate.structure in _STRUCTURES_TO_TEST:
+        if candidate.structure in _TESTED_STRUCTURES:
             yield candidate
 
 
@@ -218,7 +221,7 @@ def _promising_changes(
     candidate: Candidate,
     backlash_angle: NDArray[np.float64],
     highest_bic: float,
-) -> Iterator[tuple[Effect, float]]:
+) -> Iterator[tuple[ChangingProperty, float]]:
     """Yield the changes with which a candidate may become the best one, with their predicted BIC.
 
     The lowest BIC is first. A change must reduce the deviance significantly, and its BIC must be
@@ -230,7 +233,8 @@ def _promising_changes(
         np.array(list(effect_spectra.values()))
     )
     for changing_property, cost_reduction in sorted(
-        zip(effect_spectra, cost_reductions.tolist(), strict=True), key=lambda pair: -pair[1]
+        zip(effect_spectra, cost_reductions.tolist(), strict=True),
+        key=lambda property_and_reduction: -property_and_reduction[1],
     ):
         remaining_cost = max(candidate_refit.cost - cost_reduction, 1e-3 * candidate_refit.cost)
         deviance_reduction = candidate.compared_value_count * math.log(
@@ -244,14 +248,14 @@ def _promising_changes(
 def _fit_with_change(
     candidate_set: CandidateSet,
     candidate: Candidate,
-    changing_property: Effect,
+    changing_property: ChangingProperty,
     backlash_angle: NDArray[np.float64],
 ) -> tuple[Refit, float]:
     """Fit a candidate with one change along the record. Return the fit and its BIC."""
     change_refit = candidate_set.refit(candidate, 1)
     beam_unknowns = change_refit.objective.unknowns
     change_size = 0.0
-    for _ in range(_MAX_SIZE_FITS):
+    for _ in range(_MAX_CHANGE_SIZE_FITS):
         change_spectrum = _torque_spectrum(
             candidate_set.comparison,
             change_refit.plant,
@@ -270,7 +274,7 @@ def _fit_with_change(
             max_evaluations=DESCENT_EVALUATIONS,
         )
         previous_size, change_size = change_size, float(change_refit.amplitudes()[0][-1])
-        is_converged = abs(change_size - previous_size) < _RELATIVE_SIZE_TOLERANCE * abs(
+        is_converged = abs(change_size - previous_size) < _RELATIVE_CHANGE_SIZE_TOLERANCE * abs(
             change_size
         )
         if (
@@ -288,7 +292,7 @@ def _fit_with_change(
 
 def _torque_spectra(
     comparison: Comparison, plant: Plant, backlash_angle: NDArray[np.float64]
-) -> dict[Effect, NDArray[np.complex128]]:
+) -> dict[ChangingProperty, NDArray[np.complex128]]:
     """Return the torque spectrum of each possible change per unit of its size, each (K,)."""
     torque_slopes = _torque_slopes(comparison, plant)
     return {
@@ -299,7 +303,9 @@ def _torque_spectra(
     }
 
 
-def _torque_slopes(comparison: Comparison, plant: Plant) -> dict[Effect, NDArray[np.float64]]:
+def _torque_slopes(
+    comparison: Comparison, plant: Plant
+) -> dict[ChangingProperty, NDArray[np.float64]]:
     """Return the torque change in N·m per relative change of damping, stiffness and gain.
 
     Each has the shape (samples,).
@@ -318,9 +324,9 @@ def _torque_spectrum(
     comparison: Comparison,
     plant: Plant,
     backlash_angle: NDArray[np.float64],
-    changing_property: Effect,
+    changing_property: ChangingProperty,
     change_size: float,
-    torque_slopes: Mapping[Effect, NDArray[np.float64]] | None = None,
+    torque_slopes: Mapping[ChangingProperty, NDArray[np.float64]] | None = None,
 ) -> NDArray[np.complex128]:
     """Return the torque spectrum of an effect at a given size, divided by that size, shape (K,).
 
@@ -337,27 +343,29 @@ def _torque_spectrum(
         unit_ramp * (torque_slopes or _torque_slopes(comparison, plant))[changing_property]
     )
     if changing_property != "gain":
-        torque_change += memory_torque(comparison, plant, unit_ramp, changing_property, change_size)
+        torque_change += torque_change_by_past_values(
+            comparison, plant, unit_ramp, changing_property, change_size
+        )
     return comparison.spectrum(torque_change)
 
 
 def _clock_torque(comparison: Comparison, plant: Plant, change_size: float) -> NDArray[np.float64]:
-    """Return the torque change in N·m by different clock rates, per `_CLOCK_UNIT`, (samples,).
+    """Return the torque change in N·m by different clock rates, per `_CLOCK_RATE_UNIT`, (samples,).
 
     The torque stamped t is that of the time t plus the rate difference times the time since the
     middle of the record. It is computed by its Taylor series, for the rate difference
-    `change_size` in units of `_CLOCK_UNIT`.
+    `change_size` in units of `_CLOCK_RATE_UNIT`.
     """
     prediction, time_s = comparison.torque_predictor, comparison.times_s()
-    offset_s = _CLOCK_UNIT * (time_s - time_s.mean())
+    unit_time_offset_s = _CLOCK_RATE_UNIT * (time_s - time_s.mean())
     response_grid = ResponseGrid(prediction.s)
     response_derivative = response_grid.evaluate(plant)[0]
-    taylor_factor = offset_s
-    torque_change = np.zeros(offset_s.size)
-    for term_number in range(1, _TAYLOR_TERMS + 1 if change_size else 2):
+    taylor_factor = unit_time_offset_s
+    torque_change = np.zeros(unit_time_offset_s.size)
+    for term_number in range(1, _CLOCK_TAYLOR_TERM_COUNT + 1 if change_size else 2):
         response_derivative = response_derivative * response_grid.s
         torque_change += taylor_factor * prediction.to_time_series(response_derivative)
-        taylor_factor = taylor_factor * change_size * offset_s / (term_number + 1)
+        taylor_factor = taylor_factor * change_size * unit_time_offset_s / (term_number + 1)
     return torque_change
 
 
@@ -371,8 +379,8 @@ def _backlash_angle(comparison: Comparison) -> NDArray[np.float64]:
     highest_hz = float(comparison.frequency_hz[-1])
     shaft_angle_rad = comparison.measurement.angle_from_rest_rad(highest_hz)
     hub_angle_rad = _hub_angle(shaft_angle_rad, UNIT_BACKLASH_RAD / 2)
-    lag_rad: NDArray[np.float64] = comparison.decimation.apply(hub_angle_rad - shaft_angle_rad)
-    return lag_rad
+    hub_lag_rad: NDArray[np.float64] = comparison.decimation.apply(hub_angle_rad - shaft_angle_rad)
+    return hub_lag_rad
 
 
 def _hub_angle(
@@ -388,34 +396,34 @@ def _hub_angle(
         shaft_angle_rad + half_backlash_rad,
     )
     lowest_rad[0] = highest_rad[0] = np.clip(0.0, lowest_rad[0], highest_rad[0])
-    combined_samples = 1
-    while (undecided := np.flatnonzero(lowest_rad < highest_rad)).size:
-        limits = lowest_rad[undecided], highest_rad[undecided]
-        before = undecided - combined_samples
-        lowest_rad[undecided], highest_rad[undecided] = (
-            np.clip(lowest_rad[before], *limits),
-            np.clip(highest_rad[before], *limits),
+    combined_sample_count = 1
+    while (undecided_samples := np.flatnonzero(lowest_rad < highest_rad)).size:
+        undecided_limits_rad = lowest_rad[undecided_samples], highest_rad[undecided_samples]
+        earlier_samples = undecided_samples - combined_sample_count
+        lowest_rad[undecided_samples], highest_rad[undecided_samples] = (
+            np.clip(lowest_rad[earlier_samples], *undecided_limits_rad),
+            np.clip(highest_rad[earlier_samples], *undecided_limits_rad),
         )
-        combined_samples *= 2
+        combined_sample_count *= 2
     return lowest_rad
 
 
 # Effect of past values of damping and stiffness
 
-_PADDING_RATIO: Final = 1.5
+_TRANSFORM_PADDING_RATIO: Final = 1.5
 """Length of the transforms over that of the record."""
 
-_DECAY_EXPONENT: Final = 9.0
+_TRANSFORM_DECAY_EXPONENT: Final = 9.0
 """Decay exponent of the `CausalTransform`, as in `analysis.identify._nonlinear`."""
 
-_MAX_SIZE_ORDER: Final = 12
+_MAX_CHANGE_SIZE_ORDER: Final = 12
 """Highest order in the size of the change to which the torque is computed."""
 
-_STRESS_TOLERANCE: Final = 1e-4
+_RELATIVE_STRESS_TOLERANCE: Final = 1e-4
 """Relative change of the stress below which higher orders are left out."""
 
 
-def memory_torque(
+def torque_change_by_past_values(
     comparison: Comparison,
     plant: Plant,
     relative_change: NDArray[np.float64],
@@ -428,30 +436,39 @@ def memory_torque(
     `relative_change`, shape (samples,), is w of the module's equations at the retained samples,
     constant before and after; `change_size` is e. If the stiffness changes, the mass is constant.
     """
-    n = comparison.angle_rad.size
+    sample_count = comparison.angle_rad.size
     transform = CausalTransform.for_record(
-        n, comparison.decimation.rate_hz, _PADDING_RATIO, _DECAY_EXPONENT
+        sample_count,
+        comparison.decimation.rate_hz,
+        _TRANSFORM_PADDING_RATIO,
+        _TRANSFORM_DECAY_EXPONENT,
     )
-    s = transform.s
+    laplace_variable = transform.s
     retained_samples = comparison.retained_samples
-    w = np.interp(
-        np.arange(n), np.arange(retained_samples.start, retained_samples.stop), relative_change
+    change_over_time = np.interp(
+        np.arange(sample_count),
+        np.arange(retained_samples.start, retained_samples.stop),
+        relative_change,
     )
     damping, beam = plant.damping, plant.beam
-    internal_damping = damping.zeta * s**damping.alpha
-    external_damping = damping.gamma * s**damping.lambda_
-    inertial_term = beam.density_over_stiffness * s * s + external_damping
+    internal_damping = damping.zeta * laplace_variable**damping.alpha
+    external_damping = damping.gamma * laplace_variable**damping.lambda_
+    inertial_term = (
+        beam.density_over_stiffness * laplace_variable * laplace_variable + external_damping
+    )
     changing_factor = internal_damping + 1 if changing_property == "stiffness" else internal_damping
-    angle_transform = transform.forward(comparison.angle_rad) * plant.channel_response(s)
-    total_torque = np.zeros(n)
+    angle_transform = transform.forward(comparison.angle_rad) * plant.channel_response(
+        laplace_variable
+    )
+    total_torque = np.zeros(sample_count)
 
-    def in_time(laplace_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def to_time_series(laplace_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Convert a Laplace transform to values over time, shape (n,)."""
-        return transform.inverse(laplace_transform, n)
+        return transform.inverse(laplace_transform, sample_count)
 
-    def weighted(laplace_transform: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def multiply_by_change(laplace_transform: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the transform of w times a quantity, from the transform of the quantity."""
-        return transform.forward(w * in_time(laplace_transform))
+        return transform.forward(change_over_time * to_time_series(laplace_transform))
 
     k4_of_modes = (eigenvalues(comparison.visible_mode_count) / beam.length_m) ** 4
     modal_stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * k4_of_modes)
@@ -463,8 +480,8 @@ def memory_torque(
         )
         constant_stress = modal_stress = stress_per_angle * angle_transform
         vibration_change = np.zeros_like(modal_stress)
-        for _ in range(_MAX_SIZE_ORDER if change_size else 1):
-            vibration_change = -modal_compliance * weighted(modal_stress)
+        for _ in range(_MAX_CHANGE_SIZE_ORDER if change_size else 1):
+            vibration_change = -modal_compliance * multiply_by_change(modal_stress)
             previous_stress, modal_stress = (
                 modal_stress,
                 constant_stress
@@ -472,17 +489,17 @@ def memory_torque(
             )
             if (
                 np.abs(modal_stress - previous_stress).max()
-                < _STRESS_TOLERANCE * np.abs(constant_stress).max()
+                < _RELATIVE_STRESS_TOLERANCE * np.abs(constant_stress).max()
             ):
                 break
         modal_deflection = (1 - rigid_response) * angle_transform + change_size * vibration_change
-        torque_part = in_time(inertial_term * vibration_change) + w * in_time(
-            external_damping * modal_deflection
-        )
+        torque_part = to_time_series(
+            inertial_term * vibration_change
+        ) + change_over_time * to_time_series(external_damping * modal_deflection)
         total_torque += modal_stiffness * (
             torque_part
-            - w
-            * in_time(
+            - change_over_time
+            * to_time_series(
                 external_damping * (1 - rigid_response) * angle_transform
                 - rigid_response * constant_stress
             )
@@ -492,7 +509,7 @@ def memory_torque(
 
 # Findings
 
-_EFFECT_NAMES: Final[dict[Effect, str]] = {
+_EFFECT_NAMES: Final[dict[ChangingProperty, str]] = {
     "damping": "Damping that changes along the record",
     "stiffness": "Stiffness that changes along the record",
     "gain": "A torque gain that changes along the record",
@@ -501,7 +518,7 @@ _EFFECT_NAMES: Final[dict[Effect, str]] = {
 }
 """Name of each effect, as the beginning of a sentence."""
 
-_FINDING_KINDS: Final[dict[Effect, FindingKind]] = {
+_FINDING_KINDS: Final[dict[ChangingProperty, FindingKind]] = {
     "damping": "drifting damping",
     "stiffness": "drifting stiffness",
     "gain": "drifting gain",
@@ -570,7 +587,7 @@ def _size_text(temporal_change: TemporalChange) -> str:
     return f"{100 * temporal_change.size:+.2g} % from beginning to end"
 
 
-_DISPLAY_FACTORS: Final[Mapping[Effect, float]] = {"play": 1e3, "clock": 1e6}
+_DISPLAY_FACTORS: Final[Mapping[ChangingProperty, float]] = {"play": 1e3, "clock": 1e6}
 """Factor from the size to its value in text: mrad, ppm. It is 100 for changes in per cent."""
 
 _TWO_WAY_SWEEP_ADVICE: Final = (

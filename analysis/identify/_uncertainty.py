@@ -42,7 +42,7 @@ _MAX_LN_PIVOT_FREQUENCY: Final = 50.0
 
 
 def covariance_of_unknowns(
-    jacobian: NDArray[np.complex128], residual_variance: float, at_bound: NDArray[np.bool_]
+    jacobian: NDArray[np.complex128], residual_variance: float, is_at_bound: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the covariance of those unknowns that the data determine.
 
@@ -53,7 +53,7 @@ def covariance_of_unknowns(
     """
     hessian_matrix = (jacobian.conj() @ jacobian.T).real
     hessian_scale = np.sqrt(np.diag(hessian_matrix))
-    is_determined = ~at_bound & (hessian_scale > 0) & np.isfinite(hessian_scale)
+    is_determined = ~is_at_bound & (hessian_scale > 0) & np.isfinite(hessian_scale)
     covariance = np.zeros_like(hessian_matrix)
     if not is_determined.any():
         return covariance, is_determined
@@ -83,19 +83,20 @@ class ParameterUncertainty:
 
 def parameter_uncertainty(
     unknowns: Unknowns,
-    x: NDArray[np.float64],
-    at_bound: NDArray[np.bool_],
+    vector_of_unknowns: NDArray[np.float64],
+    is_at_bound: NDArray[np.bool_],
     unknown_covariance: NDArray[np.float64],
     is_determined: NDArray[np.bool_],
 ) -> ParameterUncertainty:
     """Return standard deviations and intervals of the plant parameters at a minimum.
 
     They follow from the covariance of the unknowns, shape (k, k), which is 0 in rows and columns of
-    unknowns that are not determined. `x`, `at_bound` and `is_determined` have the shape (k,).
+    unknowns that are not determined. `vector_of_unknowns`, `is_at_bound` and `is_determined` have
+    the shape (k,).
     """
-    parameter_slopes = unknowns.estimates_by_unknowns(x)
+    parameter_slopes = unknowns.estimates_by_unknowns(vector_of_unknowns)
     parameter_covariance = parameter_slopes @ unknown_covariance @ parameter_slopes.T
-    parameter_names, parameter_values = unknowns.names, unknowns.parameters(x)
+    parameter_names, parameter_values = unknowns.names, unknowns.parameters(vector_of_unknowns)
     is_logarithmic = np.array(
         [parameter_name in LOGARITHMIC_PARAMETERS for parameter_name in parameter_names]
     )
@@ -108,30 +109,32 @@ def parameter_uncertainty(
         for parameter_name, is_known in zip(parameter_names, is_determined, strict=True)
         if is_known
     )
-    std: dict[str, float | None] = dict.fromkeys(parameter_values, 0.0) | dict.fromkeys(
+    stds_by_parameter: dict[str, float | None] = dict.fromkeys(
+        parameter_values, 0.0
+    ) | dict.fromkeys(parameter_names, None)
+    intervals_by_parameter: dict[str, tuple[float, float] | None] = dict.fromkeys(
         parameter_names, None
     )
-    intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(parameter_names, None)
     for parameter_name, natural_std in zip(
         determined_names, np.sqrt(np.diag(determined_covariance)).tolist(), strict=True
     ):
-        std[parameter_name] = (
+        stds_by_parameter[parameter_name] = (
             parameter_values[parameter_name] * natural_std
             if parameter_name in LOGARITHMIC_PARAMETERS
             else natural_std
         )
-        intervals[parameter_name] = interval(
+        intervals_by_parameter[parameter_name] = interval(
             parameter_name, parameter_values[parameter_name], natural_std
         )
     first_omega_rad_s, _second_omega_rad_s = unknowns.omega_rad_s
     return ParameterUncertainty(
-        std=std,
-        interval=intervals,
+        std=stds_by_parameter,
+        interval=intervals_by_parameter,
         determined=determined_names,
         covariance=determined_covariance,
         at_bounds=tuple(
             parameter_name
-            for parameter_name, is_held in zip(parameter_names, at_bound, strict=True)
+            for parameter_name, is_held in zip(parameter_names, is_at_bound, strict=True)
             if is_held
         ),
         internal=pivot_loss_factor(
@@ -210,28 +213,31 @@ def pivot_loss_factor(
     """
     if coefficient_name not in determined_names:
         return None
-    i = list(determined_names).index(coefficient_name)
+    coefficient_index = list(determined_names).index(coefficient_name)
     if order_name not in determined_names:
         return PivotLossFactor(
             None,
             parameter_values[coefficient_name],
-            parameter_values[coefficient_name] * covariance[i, i] ** 0.5,
+            parameter_values[coefficient_name]
+            * covariance[coefficient_index, coefficient_index] ** 0.5,
         )
-    j = list(determined_names).index(order_name)
+    order_index = list(determined_names).index(order_name)
     order_phase_rad = math.pi / 2 * parameter_values[order_name]
     ln_loss_gradient = np.zeros(len(determined_names))
-    ln_loss_gradient[i] = 1.0
+    ln_loss_gradient[coefficient_index] = 1.0
     # The loss of external damping is relative to the inertia rho/EI omega².
     ratio_name, inertia_power = "density_over_stiffness", 2 if coefficient_name == "gamma" else 0
     if inertia_power and ratio_name in determined_names:
         ln_loss_gradient[list(determined_names).index(ratio_name)] = -1.0
     # At this derivative of ln loss by the order, ln loss and order are uncorrelated:
-    pivot_slope = -float(ln_loss_gradient @ covariance[:, j]) / covariance[j, j]
+    pivot_slope = (
+        -float(ln_loss_gradient @ covariance[:, order_index]) / covariance[order_index, order_index]
+    )
     phase_term = math.pi / 2 / math.tan(order_phase_rad)
     ln_omega = max(pivot_slope - phase_term, math.log(min_omega_rad_s))
     if abs(ln_omega) > _MAX_LN_PIVOT_FREQUENCY:
         return None  # an almost undetermined order has no pivot frequency
-    ln_loss_gradient[j] = ln_omega + phase_term
+    ln_loss_gradient[order_index] = ln_omega + phase_term
     inertia_scale = parameter_values[ratio_name] if inertia_power else 1.0
     loss_factor = parameter_values[coefficient_name] / inertia_scale * math.sin(order_phase_rad)
     loss_factor *= math.exp((parameter_values[order_name] - inertia_power) * ln_omega)
@@ -262,7 +268,7 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
         natural_rad_s = math.sqrt((p * q).real)
         damping_ratio = -(p + q).real / (2 * natural_rad_s)
         frequency_rad_s_slope = (q * dp + p * dq).real / (2 * natural_rad_s)
-        ratio_slope = (
+        damping_ratio_slope = (
             -(dp + dq).real / (2 * natural_rad_s)
             - damping_ratio * frequency_rad_s_slope / natural_rad_s
         )
@@ -273,7 +279,7 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
                 frequency_hz=abs(p.imag) / (2 * np.pi),
                 frequency_std_hz=_propagated_std(frequency_hz_slope, covariance),
                 damping_ratio=damping_ratio,
-                damping_ratio_std=_propagated_std(ratio_slope, covariance),
+                damping_ratio_std=_propagated_std(damping_ratio_slope, covariance),
             )
         )
     return tuple(mode_estimates)
@@ -311,18 +317,18 @@ def ringing(
         nuisance_spectra[:decay_count],
         projected_residual.amplitudes[:decay_count],
     )
-    explained_squares = float(
+    explained_cost = float(
         decay_amplitudes
         @ projected_residual.amplitude_gram[:decay_count, :decay_count]
         @ decay_amplitudes
     )
     if len(hum_spectra) and decay_amplitudes.size:
-        decay_free_residual = projected_residual.residual - decay_amplitudes @ nuisance_spectra
-        best_factors, remaining_squares = _best_combination(
-            decay_free_residual, np.concatenate([nuisance_spectra, hum_spectra])
+        residual_without_decays = projected_residual.residual - decay_amplitudes @ nuisance_spectra
+        best_factors, remaining_cost = _least_squares_combination(
+            residual_without_decays, np.concatenate([nuisance_spectra, hum_spectra])
         )
-        explained_squares = (
-            _best_combination(decay_free_residual, hum_spectra)[1] - remaining_squares
+        explained_cost = (
+            _least_squares_combination(residual_without_decays, hum_spectra)[1] - remaining_cost
         )
         decay_amplitudes = best_factors[: decay_amplitudes.size]
     mode_amplitudes: dict[int, float] = {}
@@ -338,12 +344,12 @@ def ringing(
         first_column += column_count
     return Ringing(
         amplitude_nm=tuple(mode_amplitudes.values()),
-        chi_square=explained_squares / residual_variance,
+        chi_square=explained_cost / residual_variance,
         degrees_of_freedom=decay_amplitudes.size,
     )
 
 
-def _best_combination(
+def _least_squares_combination(
     target_spectrum: NDArray[np.complex128], basis_spectra: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], float]:
     """Fit a spectrum by a linear combination of m other spectra with real factors.
@@ -357,6 +363,6 @@ def _best_combination(
         (real_spectra / spectrum_norms[:, None]).T,
         target_spectrum.view(np.float64),
     )
-    scaled_factors = np.linalg.lstsq(scaled_spectra, real_values)[0]
-    unexplained_values = real_values - scaled_spectra @ scaled_factors
-    return scaled_factors / spectrum_norms, float(unexplained_values @ unexplained_values)
+    scaled_coefficients = np.linalg.lstsq(scaled_spectra, real_values)[0]
+    unexplained_values = real_values - scaled_spectra @ scaled_coefficients
+    return scaled_coefficients / spectrum_norms, float(unexplained_values @ unexplained_values)

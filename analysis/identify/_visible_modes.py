@@ -18,23 +18,23 @@ _MIN_RESONANCE_DEVIANCE: Final = 400.0
 """Deviance by which a response with a resonance must be better than a smooth one. The resonance is
 then known to a twentieth of its height, and its damping to about a tenth."""
 
-_MIN_RESIDUAL_OVER_NOISE: Final = 1.4
+_MIN_RESIDUAL_TO_NOISE_RATIO: Final = 1.4
 """Chi-square of a smooth response, relative to that of noise, from which a mode is visible. The
 noise is known to 10-20 % only."""
 
-_MIN_RELATIVE_REACH: Final = 0.05
+_MIN_RELATIVE_WINDOW_HALF_WIDTH: Final = 0.05
 """Smallest half width of the window around a mode, relative to its frequency."""
 
-_REACH_IN_HALF_WIDTHS: Final = 4.0
+_WINDOW_TO_RESONANCE_HALF_WIDTH: Final = 4.0
 """Half width of the window, in half widths of the resonance."""
 
-_MAX_RELATIVE_REACH: Final = 0.4
+_MAX_RELATIVE_WINDOW_HALF_WIDTH: Final = 0.4
 """Largest half width of the window, relative to the frequency of the mode."""
 
-_MIN_BINS_PER_SIDE: Final = 8
+_MIN_WINDOW_BINS_PER_SIDE: Final = 8
 """Smallest number of bins to either side of a mode."""
 
-_SMOOTH_DEGREE: Final = 2
+_SMOOTH_RESPONSE_DEGREE: Final = 2
 """Degree in frequency of the polynomial for a response without a resonance near the mode."""
 
 _MIN_EXCITATION_RATIO: Final = 0.2
@@ -56,32 +56,32 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
     visible_numbers = []
     for mode_estimate in fit.modes:
         offset_hz = comparison.frequency_hz - mode_estimate.frequency_hz
-        reach_hz = _window_half_width_hz(
+        window_half_width_hz = _window_half_width_hz(
             comparison, mode_estimate.frequency_hz, mode_estimate.damping_ratio
         )
-        in_window = (np.abs(offset_hz) < reach_hz) & noise.is_compared
-        degrees_of_freedom = 2 * (int(np.count_nonzero(in_window)) - _SMOOTH_DEGREE - 1)
-        if degrees_of_freedom < _MIN_BINS_PER_SIDE:
+        is_in_window = (np.abs(offset_hz) < window_half_width_hz) & noise.is_compared
+        degrees_of_freedom = 2 * (int(np.count_nonzero(is_in_window)) - _SMOOTH_RESPONSE_DEGREE - 1)
+        if degrees_of_freedom < _MIN_WINDOW_BINS_PER_SIDE:
             continue
-        noise_weight = noise.weight[in_window]
+        noise_weight = noise.weight[is_in_window]
         smooth_chi_square = _smooth_response_chi_square(
-            torque_spectrum[in_window] * noise_weight,
-            angle_spectrum[in_window] * noise_weight,
-            offset_hz[in_window] / reach_hz,
+            torque_spectrum[is_in_window] * noise_weight,
+            angle_spectrum[is_in_window] * noise_weight,
+            offset_hz[is_in_window] / window_half_width_hz,
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
         has_evidence = (
             smooth_chi_square - degrees_of_freedom > _MIN_RESONANCE_DEVIANCE
-            and smooth_chi_square > _MIN_RESIDUAL_OVER_NOISE * degrees_of_freedom
+            and smooth_chi_square > _MIN_RESIDUAL_TO_NOISE_RATIO * degrees_of_freedom
         )
         # With many bins a resonance may be below the noise of each and still be significant.
-        fit_chi_square = float(np.vdot(fit.residual[in_window], fit.residual[in_window]).real)
+        fit_chi_square = float(np.vdot(fit.residual[is_in_window], fit.residual[is_in_window]).real)
         if has_evidence or smooth_chi_square - fit_chi_square > _MIN_RESONANCE_DEVIANCE:
             visible_numbers.append(mode_estimate.number)
     return tuple(visible_numbers)
 
 
-def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
+def is_excited(comparison: Comparison, frequency_hz: float, compared_hz: float) -> bool:
     """Return whether the excitation near a frequency is at least 0.2 of that near another one."""
     measurement = comparison.measurement
     reference_rad = measurement.reference_rad
@@ -91,16 +91,19 @@ def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: floa
         else reference_rad - reference_rad[0]
     )
     excitation_power = np.abs(np.fft.rfft(excitation_rad)) ** 2
-    hz = np.fft.rfftfreq(excitation_rad.size, 1 / measurement.rate_hz)
+    frequencies_hz = np.fft.rfftfreq(excitation_rad.size, 1 / measurement.rate_hz)
 
-    def amplitude(at_hz: float) -> float:
+    def mean_power_near(centre_hz: float) -> float:
         """Return the root-mean-square amplitude of the excitation near a frequency."""
-        in_window = np.abs(hz - at_hz) <= max(
-            _MIN_RELATIVE_REACH * at_hz, _MIN_BINS_PER_SIDE * hz[1]
+        is_in_window = np.abs(frequencies_hz - centre_hz) <= max(
+            _MIN_RELATIVE_WINDOW_HALF_WIDTH * centre_hz,
+            _MIN_WINDOW_BINS_PER_SIDE * frequencies_hz[1],
         )
-        return math.sqrt(float(np.mean(excitation_power[in_window]))) if in_window.any() else 0.0
+        return (
+            math.sqrt(float(np.mean(excitation_power[is_in_window]))) if is_in_window.any() else 0.0
+        )
 
-    return amplitude(frequency_hz) > _MIN_EXCITATION_RATIO * amplitude(relative_to_hz) > 0
+    return mean_power_near(frequency_hz) > _MIN_EXCITATION_RATIO * mean_power_near(compared_hz) > 0
 
 
 def _window_half_width_hz(
@@ -108,10 +111,11 @@ def _window_half_width_hz(
 ) -> float:
     """Return the half width in hertz of the frequency window in which a mode is tested."""
     spacing_hz = float(comparison.frequency_hz[1] - comparison.frequency_hz[0])
-    relative_reach = min(
-        max(_MIN_RELATIVE_REACH, _REACH_IN_HALF_WIDTHS * damping_ratio), _MAX_RELATIVE_REACH
+    relative_half_width = min(
+        max(_MIN_RELATIVE_WINDOW_HALF_WIDTH, _WINDOW_TO_RESONANCE_HALF_WIDTH * damping_ratio),
+        _MAX_RELATIVE_WINDOW_HALF_WIDTH,
     )
-    return max(relative_reach * frequency_hz, (_MIN_BINS_PER_SIDE + 0.5) * spacing_hz)
+    return max(relative_half_width * frequency_hz, (_MIN_WINDOW_BINS_PER_SIDE + 0.5) * spacing_hz)
 
 
 def _smooth_response_chi_square(
@@ -125,7 +129,9 @@ def _smooth_response_chi_square(
     within the window, -1 to 1.
     """
     orthonormal_spectra, _ = np.linalg.qr(
-        np.array([window_position**k * whitened_angle for k in range(_SMOOTH_DEGREE + 1)]).T
+        np.array(
+            [window_position**k * whitened_angle for k in range(_SMOOTH_RESPONSE_DEGREE + 1)]
+        ).T
     )
     unexplained_torque = whitened_torque - orthonormal_spectra @ (
         orthonormal_spectra.conj().T @ whitened_torque

@@ -40,14 +40,14 @@ class UniformBeamTest:
         Number of constants minus number of effective beam parameters.
     p_value : float or None
         Probability of at least this chi-square by chance. None without degrees of freedom.
-    modes : tuple of int
+    mode_numbers : tuple of int
         Numbers of the compared modes.
-    measured, predicted, std : ndarray, shape (4 n,)
+    measured_constants, predicted_constants, constant_stds : ndarray, shape (4 n,)
         Measured and predicted `MODE_CONSTANT_NAMES`, mode by mode, and the standard deviations of
         the measured ones.
     problem : UniformBeamProblem or None
         Fit of the uniform beam; None if not tested.
-    unknowns : ndarray, shape (7,)
+    best_fit_unknowns : ndarray, shape (7,)
         Unknowns of the fitted beam; NaN if not tested.
     """
 
@@ -55,12 +55,12 @@ class UniformBeamTest:
     chi_square: float
     degrees_of_freedom: int
     p_value: float | None
-    modes: tuple[int, ...]
-    measured: NDArray[np.float64]
-    predicted: NDArray[np.float64]
-    std: NDArray[np.float64]
+    mode_numbers: tuple[int, ...]
+    measured_constants: NDArray[np.float64]
+    predicted_constants: NDArray[np.float64]
+    constant_stds: NDArray[np.float64]
     problem: UniformBeamProblem | None
-    unknowns: NDArray[np.float64]
+    best_fit_unknowns: NDArray[np.float64]
 
     @property
     def summary(self) -> BeamUniformity:
@@ -75,7 +75,7 @@ class UniformBeamTest:
             "degrees_of_freedom": self.degrees_of_freedom,
             "constants": [
                 {
-                    "mode": self.modes[constant_index // len(MODE_CONSTANT_NAMES)],
+                    "mode": self.mode_numbers[constant_index // len(MODE_CONSTANT_NAMES)],
                     "name": MODE_CONSTANT_NAMES[constant_index % len(MODE_CONSTANT_NAMES)],
                     "measured": measured_value,
                     "std": std,
@@ -83,9 +83,9 @@ class UniformBeamTest:
                 }
                 for constant_index, (measured_value, std, predicted_value) in enumerate(
                     zip(
-                        self.measured.tolist(),
-                        self.std.tolist(),
-                        self.predicted.tolist(),
+                        self.measured_constants.tolist(),
+                        self.constant_stds.tolist(),
+                        self.predicted_constants.tolist(),
                         strict=True,
                     )
                 )
@@ -94,27 +94,27 @@ class UniformBeamTest:
 
 
 def uniform_beam_test(
-    fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
+    modal_estimate: ModalEstimate, nominal_plant: Plant, tilt_deg: float | None = None
 ) -> UniformBeamTest:
     """Test whether a uniform beam predicts the modal constants of the visible modes.
 
     Parameters
     ----------
-    fit : ModalEstimate
+    modal_estimate : ModalEstimate
         Fitted modal model with the covariance of its constants.
-    nominal : Plant
+    nominal_plant : Plant
         Rig and specimen as the file states them, with the tip mass if the file states one.
     tilt_deg : float, optional
         Angle in degrees between the beam at rest and the horizontal, as the file states it;
         positive if the tip is lower than the root.
     """
-    mode_numbers = fit.visible_mode_numbers
-    constant_rows = fit.constant_indices(mode_numbers)
+    mode_numbers = modal_estimate.visible_mode_numbers
+    constant_indices = modal_estimate.constant_indices(mode_numbers)
     measured_constants, std = (
-        fit.mode_constants[constant_rows],
-        np.sqrt(np.diag(fit.covariance)[constant_rows]),
+        modal_estimate.mode_constants[constant_indices],
+        np.sqrt(np.diag(modal_estimate.covariance)[constant_indices]),
     )
-    degrees_of_freedom = len(constant_rows) - len(PARAMETERS)
+    degrees_of_freedom = len(constant_indices) - len(PARAMETERS)
     if degrees_of_freedom <= 0:
         return UniformBeamTest(
             "not tested",
@@ -128,7 +128,7 @@ def uniform_beam_test(
             None,
             np.full(len(PARAMETERS), np.nan),
         )
-    problem = UniformBeamProblem(fit, mode_numbers, nominal, tilt_deg=tilt_deg)
+    problem = UniformBeamProblem(modal_estimate, mode_numbers, nominal_plant, tilt_deg=tilt_deg)
     best_minimum = problem.minima()[0]
     degrees_of_freedom += problem.count_idle_unknowns(best_minimum)
     p_value = float(chi_square_p_value(best_minimum.cost, degrees_of_freedom))
@@ -137,10 +137,10 @@ def uniform_beam_test(
         chi_square=best_minimum.cost,
         degrees_of_freedom=degrees_of_freedom,
         p_value=p_value,
-        modes=mode_numbers,
-        measured=measured_constants,
-        predicted=problem.constants_with_covariance(best_minimum.x),
-        std=std,
+        mode_numbers=mode_numbers,
+        measured_constants=measured_constants,
+        predicted_constants=problem.constants_with_covariance(best_minimum.x),
+        constant_stds=std,
         problem=problem,
-        unknowns=best_minimum.x,
+        best_fit_unknowns=best_minimum.x,
     )

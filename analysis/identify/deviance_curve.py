@@ -32,16 +32,16 @@ def local_minima(
     deviances : ndarray of float, shape (n,)
         Deviance at each value, minus the lowest one.
     """
-    padded_deviance = np.concatenate([[np.inf], deviances, [np.inf]])
+    padded_deviances = np.concatenate([[np.inf], deviances, [np.inf]])
     minimum_indices = np.flatnonzero(
-        (padded_deviance[1:-1] <= padded_deviance[:-2])
-        & (padded_deviance[1:-1] < padded_deviance[2:])
+        (padded_deviances[1:-1] <= padded_deviances[:-2])
+        & (padded_deviances[1:-1] < padded_deviances[2:])
     )
     minimum_indices = minimum_indices[deviances[minimum_indices] < CHI_SQUARE_95]
     distinct_indices: list[int] = []
     for low in minimum_indices[np.argsort(deviances[minimum_indices], kind="stable")].tolist():
         barrier_deviances = (
-            deviances[min(low, k) : max(low, k) + 1].max() for k in distinct_indices
+            deviances[min(low, index) : max(low, index) + 1].max() for index in distinct_indices
         )
         if all(
             barrier_deviance > deviances[low] + MIN_BARRIER_DEVIANCE
@@ -51,7 +51,7 @@ def local_minima(
     return tuple(order_values[distinct_indices].tolist())
 
 
-def admitted_interval(
+def order_interval_95(
     order_values: NDArray[np.float64], deviances: NDArray[np.float64]
 ) -> tuple[tuple[float, float], bool, bool]:
     """Return the interval of the order values whose deviance is within the 95 % limit.
@@ -91,7 +91,7 @@ def admitted_interval(
     )
 
 
-def limit_crossing(
+def order_at_deviance_limit(
     inside_value: float, outside_value: float, deviance_inside: float, deviance_outside: float
 ) -> float:
     """Interpolate the value at which a deviance crosses the 95 % limit.
@@ -113,14 +113,14 @@ def limit_crossing(
     return inside_value + crossing_fraction * (outside_value - inside_value)
 
 
-def values_outside_known(
-    known_values: list[float], value_range: tuple[float, float], spacing: float
+def orders_outside_known_range(
+    known_orders: list[float], value_range: tuple[float, float], spacing: float
 ) -> list[float]:
     """Return equally spaced values within a span, without those between known values.
 
     Parameters
     ----------
-    known_values : list of float
+    known_orders : list of float
         Values at which the profile is known.
     value_range : tuple of float
         First and last value of the span.
@@ -128,7 +128,7 @@ def values_outside_known(
         Distance between neighbouring values.
     """
     spaced_values = np.arange(value_range[0] + spacing / 2, value_range[1], spacing).tolist()
-    smallest_known, largest_known = min(known_values), max(known_values)
+    smallest_known, largest_known = min(known_orders), max(known_orders)
     return [
         spaced_value
         for spaced_value in spaced_values
@@ -136,7 +136,7 @@ def values_outside_known(
     ]
 
 
-def coarse_minima_values(height_by_value: dict[float, float]) -> list[float]:
+def values_at_local_minima(height_by_value: dict[float, float]) -> list[float]:
     """Return the positions of the local minima of a sampled curve, including its ends."""
     sorted_values = sorted(height_by_value)
     curve_heights = [
@@ -165,7 +165,7 @@ def _limit_crossing_between(
 
     It is interpolated between one index within the limit and one outside.
     """
-    return limit_crossing(
+    return order_at_deviance_limit(
         float(order_values[inside_index]),
         float(order_values[outside_index]),
         float(deviances[inside_index]),

@@ -53,17 +53,17 @@ if TYPE_CHECKING:
     RealArray = NDArray[np.float64]
     ComplexArray = NDArray[np.complex128]
 
-DRAG_MODES: Final = 5
+DRAG_MODE_COUNT: Final = 5
 """Number of beam modes that the drag force can excite in the computation."""
 
-DRAG_POINTS: Final = 16
+DRAG_POINT_COUNT: Final = 16
 """Number of points along the beam at which the drag force is computed."""
 
-_OVERSAMPLING: Final = 3
+_SPEED_OVERSAMPLING: Final = 3
 """Time steps per sample. The band ends at 0.4 of the rate, so up to three times its end nothing is
 aliased into it."""
 
-_PAST_FORCES: Final = 3
+_PAST_FORCE_COUNT: Final = 3
 """Number of earlier forces that the interpolation polynomial passes through, in addition to the
 present force."""
 
@@ -80,14 +80,14 @@ _DIVERGED_SPEED_RATIO: Final = 10.0
 _STEPS_PER_CHUNK: Final = 4096
 """Number of time steps whose matrices are computed together."""
 
-_LONGEST_UNDIVIDED_STEPS: Final = 300_000
+_MAX_UNDIVIDED_STEPS: Final = 300_000
 """Maximum number of time steps for which the forces at all points are computed at once: those of a
 record that is analysed at its full rate. Chunks would change the last digits."""
 
-_QUADRATURE_POINTS: Final = 12
+_STEP_QUADRATURE_POINTS: Final = 12
 """Number of Gauss-Legendre points for the integral over one time step."""
 
-_DECREASING_EXPONENT: Final = 1 / 3
+_DECREASING_DRAG_EXPONENT: Final = 1 / 3
 """Power of the speed in the drag force per speed if C_D falls as the power -2/3."""
 
 
@@ -106,17 +106,18 @@ class DragLaw:
     ----------
     constant_m : float
         Part of C_D d that does not depend on the speed, in m.
-    decreasing_part : float
+    decreasing_coefficient : float
         Part of C_D d that falls with the speed: its value at 1 m/s, in m (m/s)^(2/3).
     """
 
     constant_m: float
-    decreasing_part: float = 0.0
+    decreasing_coefficient: float = 0.0
 
-    def at(self, speed_m_s: float) -> float:
+    def drag_at_speed_m(self, speed_m_s: float) -> float:
         """Return drag coefficient times diameter, C_D d, in m at a speed in m/s."""
         return float(
-            self.constant_m + self.decreasing_part * speed_m_s ** (_DECREASING_EXPONENT - 1)
+            self.constant_m
+            + self.decreasing_coefficient * speed_m_s ** (_DECREASING_DRAG_EXPONENT - 1)
         )
 
 
@@ -136,10 +137,10 @@ class DragTorque:
         Derivatives by c_0 and c_1 of an external damping ``c_0 + c_1 s`` that drives each of the
         two lowest modes, with constant poles.
     law_derivatives : ndarray, shape (2, m)
-        Derivatives by `DragLaw.constant_m` and `DragLaw.decreasing_part`.
+        Derivatives by `DragLaw.constant_m` and `DragLaw.decreasing_coefficient`.
     delay_derivative : ndarray, shape (m,)
         Derivative by the delay of the torque, in N·m/s.
-    speed_m_s : float
+    mean_speed_m_s : float
         Mean speed over beam and record, weighted with the power dissipated by drag.
     top_speed_m_s : float
         Highest speed of any point of the beam.
@@ -151,7 +152,7 @@ class DragTorque:
     external_damping_derivatives: RealArray
     law_derivatives: RealArray
     delay_derivative: RealArray
-    speed_m_s: float
+    mean_speed_m_s: float
     top_speed_m_s: float
 
     @property
@@ -160,7 +161,7 @@ class DragTorque:
 
         Poles and drag law are held constant.
         """
-        law_coefficients = np.array([self.law.constant_m, self.law.decreasing_part])
+        law_coefficients = np.array([self.law.constant_m, self.law.decreasing_coefficient])
         torque_derivative: RealArray = self.torque_nm - law_coefficients @ self.law_derivatives
         return torque_derivative
 
@@ -197,23 +198,27 @@ class DragResponse:
         self._transform = CausalTransform.for_record(angle_rad.size, rate_hz)
         self.s = s = self._transform.s
         beam, damping = plant.beam, plant.damping
-        self._grid = DragGrid.along_beam(beam, DRAG_MODES, DRAG_POINTS)
-        k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
+        self._grid = DragGrid.along_beam(beam, DRAG_MODE_COUNT, DRAG_POINT_COUNT)
+        wavenumber_fourth_powers = (eigenvalues(DRAG_MODE_COUNT) / beam.length_m) ** 4
         log_s, inertia = np.log(s), beam.density_over_stiffness * s * s
-        p = inertia + damping.gamma * np.exp(damping.lambda_ * log_s)
-        z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
-        self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
+        inertial_term = inertia + damping.gamma * np.exp(damping.lambda_ * log_s)
+        modal_impedances = inertial_term + wavenumber_fourth_powers[:, None] * (
+            1 + damping.zeta * np.exp(damping.alpha * log_s)
+        )
+        self._pole_pairs = _pole_pairs(wavenumber_fourth_powers * beam.length_m**4, plant)
         self._impedance_slopes = _impedance_slopes(self._pole_pairs, plant)
-        self._inertia_terms = [p] * DRAG_MODES
-        self._phase_factors: list[ComplexArray | float] = [1.0] * DRAG_MODES
+        self._inertia_terms = [inertial_term] * DRAG_MODE_COUNT
+        self._phase_factors: list[ComplexArray | float] = [1.0] * DRAG_MODE_COUNT
         measured_poles = measured_modes.poles_rad_s if measured_modes else {}
-        for mode_index in range(DRAG_MODES):
+        for mode_index in range(DRAG_MODE_COUNT):
             pole = measured_poles.get(mode_index + 1)
             if pole is None or measured_modes is None:
                 continue
             # The external damping of a fit without drag is arbitrary; pole and phase contain it.
             self._inertia_terms[mode_index] = inertia
-            z[mode_index] = beam.density_over_stiffness * (s - pole) * (s - pole.conjugate())
+            modal_impedances[mode_index] = (
+                beam.density_over_stiffness * (s - pole) * (s - pole.conjugate())
+            )
             self._pole_pairs[mode_index] = pole_pair = np.array([pole, pole.conjugate()])
             self._impedance_slopes[mode_index] = beam.density_over_stiffness * (
                 pole_pair - pole_pair.conjugate()
@@ -222,9 +227,12 @@ class DragResponse:
             self._phase_factors[mode_index] = self._phase_factor(pole, residue)
         # Response p over Z of each mode, one row for each
         self._inertial_response = np.array(
-            [inertia_term / row for inertia_term, row in zip(self._inertia_terms, z, strict=True)]
+            [
+                inertia_term / row
+                for inertia_term, row in zip(self._inertia_terms, modal_impedances, strict=True)
+            ]
         )
-        self._speed_per_force = s / z / beam.bending_stiffness_n_m2
+        self._speed_per_force = s / modal_impedances / beam.bending_stiffness_n_m2
         self._torque_channel = plant.channel_response(s)
         angle_transform = self._transform.forward(angle_rad)
         self._modal_speed_by_angle = -self._grid.shape_moment_m[:, None] * (
@@ -239,11 +247,13 @@ class DragResponse:
         """
         modal_speeds = self._oversampled_modal_speeds()
         step_count = modal_speeds.shape[1]
-        chunk_length = step_count if step_count <= _LONGEST_UNDIVIDED_STEPS else _STEPS_PER_CHUNK
+        chunk_length = step_count if step_count <= _MAX_UNDIVIDED_STEPS else _STEPS_PER_CHUNK
         for first_step in range(0, step_count, chunk_length):
             # The forces replace the speeds: the rows of a long record take much memory.
-            steps = modal_speeds[:, first_step : first_step + chunk_length]
-            steps[:] = self._modal_forces(_drag_force(self._point_speed(steps), DragLaw(1.0)))
+            speed_chunk = modal_speeds[:, first_step : first_step + chunk_length]
+            speed_chunk[:] = self._modal_forces(
+                _drag_force(self._point_speed(speed_chunk), DragLaw(1.0))
+            )
         return self._torque_over_time(modal_speeds)
 
     def torque(self, law: DragLaw, mode_numbers: Sequence[int] = ()) -> DragTorque:
@@ -261,18 +271,18 @@ class DragResponse:
         DragError
             If the simulated speeds diverge.
         """
-        point_speed_m_s = self._linear_speed()
-        highest_without_drag = float(np.abs(point_speed_m_s).max())
+        point_speed_m_s = self._point_speed_without_drag()
+        top_speed_without_drag_m_s = float(np.abs(point_speed_m_s).max())
         with np.errstate(over="ignore", invalid="ignore"):
             self._add_drag_to_speeds(point_speed_m_s, law)
             top_speed_m_s = float(np.abs(point_speed_m_s).max())
-        if not top_speed_m_s <= _DIVERGED_SPEED_RATIO * highest_without_drag:
+        if not top_speed_m_s <= _DIVERGED_SPEED_RATIO * top_speed_without_drag_m_s:
             raise DragError(f"drag of {law.constant_m:g} m cannot be followed.")
         modal_forces = self._modal_forces(_drag_force(point_speed_m_s, law))
         mode_numbers = [
             mode_number
             for mode_number in mode_numbers
-            if mode_number <= DRAG_MODES and self._pole_pairs[mode_number - 1][0].imag > 0
+            if mode_number <= DRAG_MODE_COUNT and self._pole_pairs[mode_number - 1][0].imag > 0
         ]
         force_spectra = self._transform_forces(modal_forces)
         modal_speeds = self._modal_speed_by_angle + self._speed_per_force * force_spectra[:-1]
@@ -332,7 +342,7 @@ class DragResponse:
             ),
             law_derivatives=np.array(law_derivatives),
             delay_derivative=self.to_time_series(-self.s * torque_transform),
-            speed_m_s=self._mean_speed(point_speed_m_s),
+            mean_speed_m_s=self._mean_speed(point_speed_m_s),
             top_speed_m_s=top_speed_m_s,
         )
 
@@ -343,7 +353,7 @@ class DragResponse:
         return upper_poles
 
     @property
-    def _leverage(self) -> RealArray:
+    def _mode_leverage(self) -> RealArray:
         """Return ``L b_i`` in m², the first moment of the shape of each mode i about the root."""
         return self.plant.beam.length_m * self._grid.shape_moment_m
 
@@ -356,13 +366,13 @@ class DragResponse:
         )
         return speed_times_power / total_power if total_power > 0 else 0.0
 
-    def _linear_speed(self) -> RealArray:
+    def _point_speed_without_drag(self) -> RealArray:
         """Return the speeds of the beam points without drag in m/s, shape (3 m, points)."""
         return self._point_speed(self._oversampled_modal_speeds())
 
     def _oversampled_modal_speeds(self) -> RealArray:
         """Return the speeds of rotation and of each mode without drag, shape (1 + modes, 3 m)."""
-        modal_speeds = np.empty((1 + DRAG_MODES, _OVERSAMPLING * self._samples))
+        modal_speeds = np.empty((1 + DRAG_MODE_COUNT, _SPEED_OVERSAMPLING * self._samples))
         speed_transforms = (self._speed_transform, *self._modal_speed_by_angle)
         for modal_speed, speed_transform in zip(modal_speeds, speed_transforms, strict=True):
             modal_speed[:] = self._oversampled_values(speed_transform)
@@ -388,13 +398,16 @@ class DragResponse:
         state_per_force = state_per_modal_force @ self._grid.modal_force_matrix
         modal_state, force_per_m, speed_magnitude = (
             np.zeros(len(state_transition)),
-            *np.zeros((2, DRAG_POINTS)),
+            *np.zeros((2, DRAG_POINT_COUNT)),
         )
         step_output = np.zeros(len(step_matrix))
-        drag_speed_change, free_state = step_output[:DRAG_POINTS], step_output[DRAG_POINTS:]
+        drag_speed_change, free_state = (
+            step_output[:DRAG_POINT_COUNT],
+            step_output[DRAG_POINT_COUNT:],
+        )
         constant_factor, decreasing_factor = (
             -HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m,
-            -HALF_AIR_DENSITY_KG_PER_M3 * law.decreasing_part,
+            -HALF_AIR_DENSITY_KG_PER_M3 * law.decreasing_coefficient,
         )
         multiply_step, multiply_force = step_matrix.dot, state_per_force.dot
         add, multiply, take_absolute, take_cube_root = np.add, np.multiply, np.absolute, np.cbrt
@@ -431,45 +444,50 @@ class DragResponse:
         )  # the moment is no input
         run_count, force_weights = len(speed_sources) + 2, self._point_to_modal_forces
         mode_pair_weights = (
-            (force_weights[:, None] * self._grid.mode_shapes).reshape(-1, DRAG_POINTS).T
+            (force_weights[:, None] * self._grid.mode_shapes).reshape(-1, DRAG_POINT_COUNT).T
         )
         force_changes = np.empty((len(speed_m_s), len(force_weights), run_count))
-        modal_state, out = (
+        modal_state, step_output = (
             np.zeros((len(state_transition), run_count)),
             np.zeros((len(step_matrix), run_count)),
         )
-        modal_speed, free_state = out[:DRAG_MODES], out[DRAG_MODES:]
+        modal_speed, free_state = step_output[:DRAG_MODE_COUNT], step_output[DRAG_MODE_COUNT:]
         coupled_force, dot, add = np.empty(force_changes.shape[1:]), np.dot, np.add
         for first_step in range(0, len(speed_m_s), _STEPS_PER_CHUNK):
             step_range = slice(first_step, first_step + _STEPS_PER_CHUNK)
-            now, speed_magnitude = force_changes[step_range], np.abs(speed_m_s[step_range])
+            force_changes_in_chunk, speed_magnitude = (
+                force_changes[step_range],
+                np.abs(speed_m_s[step_range]),
+            )
             cube_root = np.cbrt(speed_magnitude)
             force_slope = -2 * HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m * speed_magnitude
-            if law.decreasing_part:
+            if law.decreasing_coefficient:
                 force_slope -= (
-                    (1 + _DECREASING_EXPONENT)
+                    (1 + _DECREASING_DRAG_EXPONENT)
                     * HALF_AIR_DENSITY_KG_PER_M3
-                    * law.decreasing_part
+                    * law.decreasing_coefficient
                     * cube_root
                 )
             force_per_mode_speed = (force_slope @ mode_pair_weights).reshape(
-                -1, len(force_weights), DRAG_MODES
+                -1, len(force_weights), DRAG_MODE_COUNT
             )
-            for run, (mode_index, added_speed) in enumerate(speed_sources):
+            for run_index, (mode_index, added_speed) in enumerate(speed_sources):
                 np.multiply(
                     force_per_mode_speed[:, :, mode_index],
                     added_speed[step_range, None],
-                    out=now[:, :, run],
+                    out=force_changes_in_chunk[:, :, run_index],
                 )
-            for run, law_power in (-2, speed_magnitude), (-1, cube_root):
-                now[:, :, run] = (
+            for run_index, law_power in (-2, speed_magnitude), (-1, cube_root):
+                force_changes_in_chunk[:, :, run_index] = (
                     -HALF_AIR_DENSITY_KG_PER_M3 * law_power * speed_m_s[step_range]
                 ) @ force_weights.T
-            for at, coupling_matrix in zip(now, force_per_mode_speed, strict=True):
-                dot(step_matrix, modal_state, out)
+            for force_row, coupling_matrix in zip(
+                force_changes_in_chunk, force_per_mode_speed, strict=True
+            ):
+                dot(step_matrix, modal_state, step_output)
                 dot(coupling_matrix, modal_speed, coupled_force)
-                add(at, coupled_force, at)
-                dot(state_per_force, at, modal_state)
+                add(force_row, coupled_force, force_row)
+                dot(state_per_force, force_row, modal_state)
                 add(modal_state, free_state, modal_state)
         return list(np.ascontiguousarray(force_changes.transpose(2, 1, 0)))
 
@@ -480,8 +498,8 @@ class DragResponse:
         state, and the modal forces to give the other part. The state holds two numbers for each
         mode, then the modal forces of the last three steps.
         """
-        n, step_s = DRAG_MODES, 1 / (_OVERSAMPLING * self._rate_hz)
-        state_count = 2 * n + _PAST_FORCES * n
+        n, step_s = DRAG_MODE_COUNT, 1 / (_SPEED_OVERSAMPLING * self._rate_hz)
+        state_count = 2 * n + _PAST_FORCE_COUNT * n
         state_transition, state_per_modal_force = (
             np.zeros((state_count, state_count)),
             np.zeros((state_count, n)),
@@ -511,7 +529,7 @@ class DragResponse:
             state_transition[state_rows, 2 * n + i :: n] = real_weights[:, 1:]
         # Shift the stored forces by one step.
         state_per_modal_force[2 * n : 3 * n] = np.eye(n)
-        state_transition[3 * n :, 2 * n : -n] = np.eye((_PAST_FORCES - 1) * n)
+        state_transition[3 * n :, 2 * n : -n] = np.eye((_PAST_FORCE_COUNT - 1) * n)
         # The new force is not known yet: it is extrapolated from the last three for the speed.
         extrapolating_matrix = state_transition[: 2 * n].copy()
         for steps_back, extrapolation_factor in enumerate((3.0, -3.0, 1.0)):
@@ -549,7 +567,7 @@ class DragResponse:
         # One row after another: the transforms at the higher rate take three times their result.
         return np.array(
             [
-                self._transform.forward(modal_force, oversampling=_OVERSAMPLING)
+                self._transform.forward(modal_force, oversampling=_SPEED_OVERSAMPLING)
                 for modal_force in modal_forces
             ]
         )
@@ -560,7 +578,7 @@ class DragResponse:
             [
                 leverage * (response * phase_factor) * force_spectrum
                 for leverage, response, phase_factor, force_spectrum in zip(
-                    self._leverage,
+                    self._mode_leverage,
                     self._inertial_response,
                     self._phase_factors,
                     force_spectra[:-1],
@@ -594,7 +612,9 @@ class DragResponse:
         Modes are numbered from 1. This part of the linear torque contains its whole dependence on
         the poles of the mode.
         """
-        torque_factor = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode_number - 1]
+        torque_factor = (
+            self.plant.beam.bending_stiffness_n_m2 * self._mode_leverage[mode_number - 1]
+        )
         torque_spectrum: ComplexArray = (
             torque_factor
             * self._inertia_terms[mode_number - 1]
@@ -613,8 +633,8 @@ class DragResponse:
         # The residue of -s⁴ / Z, through the torque channel, is j times a multiple of this.
         phasor = residue / (1j * pole**4 * self.plant.channel_response(pole))
         phasor /= abs(phasor)
-        factor: ComplexArray = phasor.real + phasor.imag * (self.s - pole.real) / pole.imag
-        return factor
+        phase_factor: ComplexArray = phasor.real + phasor.imag * (self.s - pole.real) / pole.imag
+        return phase_factor
 
     def _oversampled_values(self, laplace_transform: ComplexArray) -> RealArray:
         """Convert a Laplace transform to a time series at three times the sampling rate.
@@ -622,7 +642,7 @@ class DragResponse:
         The shape is (..., 3 m).
         """
         return self._transform.inverse(
-            laplace_transform, _OVERSAMPLING * self._samples, oversampling=_OVERSAMPLING
+            laplace_transform, _SPEED_OVERSAMPLING * self._samples, oversampling=_SPEED_OVERSAMPLING
         )
 
 
@@ -630,8 +650,8 @@ def _drag_force(speed_m_s: RealArray, law: DragLaw) -> RealArray:
     """Return the drag force per length of the beam in N/m, of the shape of the speeds in m/s."""
     speed_magnitude = np.abs(speed_m_s)
     force_per_speed = law.constant_m * speed_magnitude
-    if law.decreasing_part:
-        force_per_speed += law.decreasing_part * np.cbrt(speed_magnitude)
+    if law.decreasing_coefficient:
+        force_per_speed += law.decreasing_coefficient * np.cbrt(speed_magnitude)
     force_n_per_m: RealArray = -HALF_AIR_DENSITY_KG_PER_M3 * force_per_speed * speed_m_s
     return force_n_per_m
 
@@ -662,12 +682,12 @@ def _impedance_slopes(pole_pairs: ComplexArray, plant: Plant) -> ComplexArray:
 def _force_weights_of_step(poles_per_s: ComplexArray, step_s: float) -> ComplexArray:
     """Return the weights of the last forces F in one time step of the equation ``z' = p z + F``.
 
-    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with that of the
-    newest force first. Between the time steps F is the polynomial through the last forces.
+    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCE_COUNT`), with that of
+    the newest force first. Between the time steps F is the polynomial through the last forces.
     """
-    quadrature_node, quadrature_weight = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
+    quadrature_node, quadrature_weight = np.polynomial.legendre.leggauss(_STEP_QUADRATURE_POINTS)
     step_fraction = 0.5 * (quadrature_node + 1)
-    force_instants = 1.0 - np.arange(1 + _PAST_FORCES)
+    force_instants = 1.0 - np.arange(1 + _PAST_FORCE_COUNT)
     lagrange_values = np.array(
         [
             np.prod(
@@ -682,7 +702,7 @@ def _force_weights_of_step(poles_per_s: ComplexArray, step_s: float) -> ComplexA
         ]
     )
     remaining_decay = np.exp(poles_per_s[:, None] * (step_s * (1 - step_fraction)))
-    weights_of_forces: ComplexArray = (
+    force_weights: ComplexArray = (
         remaining_decay * (0.5 * step_s * quadrature_weight) @ lagrange_values.T
     )
-    return weights_of_forces
+    return force_weights

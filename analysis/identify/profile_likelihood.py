@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from analysis.identify._candidate import HOPELESS_BIC_DIFFERENCE
-from analysis.identify._refit import MISSED_COST_FRACTION, Refit
+from analysis.identify._refit import MISSED_MINIMUM_COST_FRACTION, Refit
 from analysis.identify.deviance_curve import (
     CHI_SQUARE_95,
     MIN_BARRIER_DEVIANCE,
-    admitted_interval,
-    coarse_minima_values,
-    limit_crossing,
     local_minima,
-    values_outside_known,
+    order_at_deviance_limit,
+    order_interval_95,
+    orders_outside_known_range,
+    values_at_local_minima,
 )
 from analysis.models import ORDER_RANGE
 from rigd.beam import COEFFICIENT_OF
@@ -181,7 +181,7 @@ def profile(
         profiler.extend_from_other_minima()
     order_values, deviances = profiler.curve()
     minimum_values = local_minima(order_values, deviances)
-    order_interval, open_below, open_above = admitted_interval(order_values, deviances)
+    order_interval, open_below, open_above = order_interval_95(order_values, deviances)
     lowest_cost = min(profiler.costs.values())
     return ProfileWithPlants(
         profile=LikelihoodProfile(
@@ -278,7 +278,7 @@ def _may_improve(candidate_set: CandidateSet, profile_fit: ProfileWithPlants) ->
         if free_names <= set(candidate.structure.free)
     ]
     return bool(candidate_costs) and profile_fit.cost < min(candidate_costs) * (
-        1 - MISSED_COST_FRACTION
+        1 - MISSED_MINIMUM_COST_FRACTION
     )
 
 
@@ -403,7 +403,7 @@ class OrderProfiler:
             ) and free_parameters > set(candidate.structure.free)
             if not is_special_case:
                 continue
-            (lower_end, upper_end), *_ = admitted_interval(*self.curve())
+            (lower_end, upper_end), *_ = order_interval_95(*self.curve())
             candidate_deviance = self._value_count * math.log(
                 candidate.fit.cost / min(self.costs.values())
             )
@@ -422,11 +422,13 @@ class OrderProfiler:
 
         Extend the profile from each of them.
         """
-        (lower_end, upper_end), open_below, open_above = admitted_interval(*self.curve())
+        (lower_end, upper_end), open_below, open_above = order_interval_95(*self.curve())
         is_interval_wide = upper_end - lower_end > _DOUBTFUL_FRACTION * (
             ORDER_RANGE[1] - ORDER_RANGE[0]
         )
-        trial_orders = values_outside_known(list(self.costs), ORDER_RANGE, _TRIAL_ORDER_SPACING)
+        trial_orders = orders_outside_known_range(
+            list(self.costs), ORDER_RANGE, _TRIAL_ORDER_SPACING
+        )
         if not (is_interval_wide or open_below or open_above) or not trial_orders:
             return
         # Loss and order are separate unknowns: the loss stays constant as the order changes.
@@ -440,7 +442,7 @@ class OrderProfiler:
         highest_cost = min(self.costs.values()) * math.exp(
             HOPELESS_BIC_DIFFERENCE / self._value_count
         )
-        for trial_order in coarse_minima_values(
+        for trial_order in values_at_local_minima(
             {trial_order: trial_fit.cost for trial_order, trial_fit in trial_fits.items()}
         ):
             refined_fit = self._descend(
@@ -501,7 +503,7 @@ class OrderProfiler:
             )
             if outside_root - inside_root < _INTERPOLATION_ROOT_DIFFERENCE:
                 break
-            trial_order = limit_crossing(
+            trial_order = order_at_deviance_limit(
                 inside_order, outside_order, inside_root**2, outside_root**2
             )
             if self._refit_at(trial_order, self._refits[inside_order]) ** 2 < CHI_SQUARE_95:
@@ -605,8 +607,8 @@ class OrderProfiler:
             candidate_set.effect_spectra,
             max_evaluations=max_evaluations,
             relative_tolerance=_COST_TOLERANCE,
-            held_unknowns=held_unknowns,
-            hopeless=hopeless,
+            fixed_unknowns=held_unknowns,
+            give_up_condition=hopeless,
         )
 
     def _tangent(self, order_value: float, nearest_refit: Refit) -> NDArray[np.float64]:

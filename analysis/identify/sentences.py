@@ -88,7 +88,7 @@ def uniformity(beam_test: UniformBeamTest | None) -> list[str]:
     """
     if beam_test is None or beam_test.p_value is None:
         return []
-    mode_list = listed([str(mode_number) for mode_number in beam_test.modes])
+    mode_list = listed([str(mode_number) for mode_number in beam_test.mode_numbers])
     chance_text = beam_test.summary.chance
     if beam_test.status == "passed":
         return [
@@ -401,7 +401,7 @@ def _advice_for_two_modes(candidate_set: CandidateSet, visible_numbers: tuple[in
             f"least {1.3 * expected_hz[missing_mode]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
         )
     if not is_excited(
-        candidate_set.comparison, expected_hz[missing_mode], relative_to_hz=expected_hz[other_mode]
+        candidate_set.comparison, expected_hz[missing_mode], compared_hz=expected_hz[other_mode]
     ):
         return f"excite the {_MODE_ORDINALS[missing_mode]} mode as well: sweep " + (
             f"up to at least {1.3 * expected_hz[2]:.0f} Hz."

@@ -64,7 +64,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
                 *([delta_bic[structure_name]] if delta_bic else []),
                 whole_record.analysis.fit_percent(fit),
                 fit.cost / fit.degrees_of_freedom,
-                fit.free_parameters,
+                fit.free_parameter_count,
                 fit.cost,
                 fit.cost - lowest_cost,
                 fit.degrees_of_freedom,

@@ -407,7 +407,7 @@ def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> N
     """Draw the spectrum of the residual with the noise model, the modes and the hum."""
     frequency_hz = analysis.frequency_hz
     density_nm2_per_hz = analysis.noise_nm2_per_hz * np.abs(model.residual) ** 2 / 2
-    is_compared = analysis.compared
+    is_compared = analysis.is_compared
     compared_bins = np.flatnonzero(is_compared)
     bin_blocks = np.array_split(compared_bins, max(compared_bins.size // _BINS_PER_POINT, 1))
     block_middle_hz = [float(frequency_hz[bin_block].mean()) for bin_block in bin_blocks]
@@ -442,7 +442,7 @@ def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> N
 
 def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     """Draw the residual's cumulative periodogram minus white noise's, with the 95 % range."""
-    is_compared = analysis.compared
+    is_compared = analysis.is_compared
     bin_power = np.abs(model.residual[is_compared]) ** 2
     cumulative_power = np.cumsum(bin_power) / bin_power.sum()
     uniform_distribution = np.arange(1, bin_power.size + 1) / bin_power.size
@@ -473,7 +473,7 @@ def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: Record
 def _draw_power_over_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     """Draw the power of the whitened residual over time, with the 95 % range of white noise."""
     times_s, interval_power = residual_power(analysis, model.residual)
-    half_range = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
+    half_range = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.is_compared))
     axes.axhspan(
         max(1 - half_range, 0.0), 1 + half_range, color=style.SHADE_COLOR, linewidth=0, zorder=0,
         label="95 % of white noise",
@@ -501,7 +501,7 @@ def residual_power(
     bin_spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
     bin_count = residual.size
     envelope_power = np.abs(np.fft.ifft(residual)) ** 2 * bin_count / 2
-    envelope_power *= bin_count / np.count_nonzero(analysis.compared)
+    envelope_power *= bin_count / np.count_nonzero(analysis.is_compared)
     interval_count = min(_MAX_TIME_INTERVALS, bin_count)
     interval_power: NDArray[np.float64] = np.array(
         [
@@ -562,7 +562,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
         ),
         _loss_description(whole_record, has_curves=loss_model is not None),
     )
-    mean_power_ratio = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
+    mean_power_ratio = float(np.mean(np.abs(model.residual[analysis.is_compared]) ** 2)) / 2
     yield Illustration(
         residual_name,
         partial(residual_figure, model, analysis),

@@ -39,7 +39,7 @@ _PERCENT: Final = 100.0
 
 def _modal_constant_deviations(uniformity_test: UniformBeamTest) -> NDArray[np.float64]:
     """Return measured minus predicted constants, (modes, 4), phases between -pi and pi."""
-    deviations = (uniformity_test.measured - uniformity_test.predicted).reshape(
+    deviations = (uniformity_test.measured_constants - uniformity_test.predicted_constants).reshape(
         -1, len(MODE_CONSTANT_NAMES)
     )
     phase_column = MODE_CONSTANT_NAMES.index("residue_phase_rad")
@@ -54,7 +54,7 @@ def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
     """
     constant_deviations, std = (
         _modal_constant_deviations(uniformity_test),
-        uniformity_test.std.reshape(-1, len(MODE_CONSTANT_NAMES)),
+        uniformity_test.constant_stds.reshape(-1, len(MODE_CONSTANT_NAMES)),
     )
     figure = style.new_figure(9.0, 4.0)
     grid = figure.add_gridspec(
@@ -70,21 +70,24 @@ def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
         )  # fmt: skip
         deviation_values = constant_deviations[:, panel_number] / std[:, panel_number]
         std_axes.plot(
-            uniformity_test.modes, deviation_values, "o", color=style.BLUE, markersize=5.0
+            uniformity_test.mode_numbers, deviation_values, "o", color=style.BLUE, markersize=5.0
         )
         _set_axes(
-            std_axes, uniformity_test.modes, float(np.abs(deviation_values).max()), min_limit=3.0
+            std_axes,
+            uniformity_test.mode_numbers,
+            float(np.abs(deviation_values).max()),
+            min_limit=3.0,
         )
         half_width_percent = NORMAL_95 * _PERCENT * std[:, panel_number]
         percent_values = _PERCENT * constant_deviations[:, panel_number]
         percent_axes.errorbar(
-            uniformity_test.modes, percent_values, half_width_percent, fmt="o", color=style.INK,
-            markersize=4.0,
+            uniformity_test.mode_numbers, percent_values, half_width_percent, fmt="o",
+            color=style.INK, markersize=4.0,
             capsize=3.0, elinewidth=1.0, label="measured, 95 %",
         )  # fmt: skip
         _set_axes(
             percent_axes,
-            uniformity_test.modes,
+            uniformity_test.mode_numbers,
             float((np.abs(percent_values) + half_width_percent).max()),
         )
         percent_axes.set_xlabel("Mode", labelpad=1)
@@ -139,8 +142,8 @@ def uniformity_table(uniformity_test: UniformBeamTest) -> Table:
     constant_deviations = _modal_constant_deviations(uniformity_test).ravel()
     for constant_index, (measured_value, std, predicted_value, deviation) in enumerate(
         zip(
-            uniformity_test.measured.tolist(), uniformity_test.std.tolist(),
-            uniformity_test.predicted.tolist(), constant_deviations.tolist(),
+            uniformity_test.measured_constants.tolist(), uniformity_test.constant_stds.tolist(),
+            uniformity_test.predicted_constants.tolist(), constant_deviations.tolist(),
             strict=True,
         )
     ):  # fmt: skip
@@ -149,7 +152,7 @@ def uniformity_table(uniformity_test: UniformBeamTest) -> Table:
         constant_cells = estimate_cells((measured_value, std, predicted_value), std)
         table_rows.append(
             (
-                uniformity_test.modes[constant_index // len(MODE_CONSTANT_NAMES)], name_cell,
+                uniformity_test.mode_numbers[constant_index // len(MODE_CONSTANT_NAMES)], name_cell,
                 *constant_cells,
                 number_cell(deviation / std, "+.1f"), number_cell(deviation, "+#.2g", _PERCENT),
             )

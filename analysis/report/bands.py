@@ -82,7 +82,9 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> FrequencyBand |
     )
     # A narrow-band disturbance is not an excitation, and the compared bins contain none.
     nearest_bins = np.searchsorted(analysis.frequency_hz, frequency_hz[is_in_band])
-    is_in_band[is_in_band] = analysis.compared[np.minimum(nearest_bins, analysis.compared.size - 1)]
+    is_in_band[is_in_band] = analysis.is_compared[
+        np.minimum(nearest_bins, analysis.is_compared.size - 1)
+    ]
     power_nm2_per_hz = (
         np.abs(np.fft.rfft(torque_nm)[is_in_band]) ** 2 * 2 / (torque_nm.size * record.rate_hz)
     )

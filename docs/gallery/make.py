@@ -197,7 +197,7 @@ def find(fault: Fault) -> Finding:
         record = record_of(fault, Path(folder) / "session")
         selection = select(record)
     analysis, comparison = selection.analysis, selection.analysis.comparison
-    compared = np.flatnonzero(analysis.compared)
+    compared = np.flatnonzero(analysis.is_compared)
     bins = np.array_split(compared, max(compared.size // BINS_PER_POINT, 1))
     rate_hz = comparison.decimation.rate_hz
     size = max(int(rate_hz * BLOCK_S), 1)

@@ -696,7 +696,8 @@ def _cell_text(target_estimate: TargetEstimate) -> str:
         (100.0, " %") if target_estimate.name.startswith("damping") else (1.0, "")
     )
     scaled_std = display_scale * target_estimate.std
-    return f"{with_half_width(display_scale * target_estimate.value, (-scaled_std, scaled_std))}{unit_text}"
+    value_text = with_half_width(display_scale * target_estimate.value, (-scaled_std, scaled_std))
+    return f"{value_text}{unit_text}"
 
 
 def targets_json(estimates: Sequence[TargetEstimate]) -> list[dict[str, Any]]:

@@ -62,7 +62,7 @@ def test_torque_agrees_with_time_stepping(brake, law):
         .torque_nm[comparison.retained_samples]
     )
     stepped = brake.drag_torque(
-        angle_rad, RATE_HZ, LINK, damping, law.constant_m, law.decreasing_part
+        angle_rad, RATE_HZ, LINK, damping, law.constant_m, law.decreasing_coefficient
     )
     truth = comparison.decimation.apply(stepped)[comparison.retained_samples]
     assert np.abs(truth).max() > 0.02
@@ -99,7 +99,7 @@ LAW = DragLaw(2e-3, 5e-4)
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_derivatives_by_the_law(short, index):
-    numbers = np.array([LAW.constant_m, LAW.decreasing_part])
+    numbers = np.array([LAW.constant_m, LAW.decreasing_coefficient])
     step = 1e-3 * numbers * np.eye(2)[index]
     beam = response(short, plant())
     above, below = (beam.torque(DragLaw(*(numbers + sign * step))).torque_nm for sign in (1, -1))

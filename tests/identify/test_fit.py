@@ -163,7 +163,7 @@ def test_hum_is_reported_without_bias(sessions):
     (found,), (line,) = analysis.fits, analysis.lines
     assert line.frequency_hz == pytest.approx(49.98, abs=0.01)
     assert line.amplitude_nm == pytest.approx(0.05, rel=0.05)
-    assert (found.residual[~analysis.compared] == 0).all()
+    assert (found.residual[~analysis.is_compared] == 0).all()
     assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.07)
     for name in without.determined:
         difference = abs(found.parameters[name] - without.parameters[name])
@@ -215,7 +215,7 @@ def test_no_false_hum_is_found(sessions, seed):
     session = sessions("IV", shaken=True).cut(5000)
     analysis = fit_record(session.measured(noise_nm=1e-2, seed=seed), [STRUCTURES["IV"]])
     assert analysis.lines == ()
-    assert analysis.compared.all()
+    assert analysis.is_compared.all()
 
 
 def test_residual_of_a_wrong_structure_is_no_hum(sessions):

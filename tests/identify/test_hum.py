@@ -49,7 +49,7 @@ def test_hum_on_a_mode_is_found_without_bias(sessions, quiet, offset_hz, amplitu
     (found,), (line,) = analysis.fits, analysis.lines
     assert line.frequency_hz == pytest.approx(hz, abs=2e-3)
     assert line.amplitude_nm == pytest.approx(amplitude_nm, abs=3e-4)
-    assert analysis.compared.all()  # nothing of the resonance is left out
+    assert analysis.is_compared.all()  # nothing of the resonance is left out
     assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.1)
     assert not found.ringing.is_significant
     for name in quiet.determined:

@@ -5,11 +5,11 @@ import pytest
 
 from analysis.identify.deviance_curve import (
     CHI_SQUARE_95,
-    admitted_interval,
-    coarse_minima_values,
-    limit_crossing,
     local_minima,
-    values_outside_known,
+    order_at_deviance_limit,
+    order_interval_95,
+    orders_outside_known_range,
+    values_at_local_minima,
 )
 from analysis.identify.profile_likelihood import LikelihoodProfile
 
@@ -24,7 +24,7 @@ def double(depth):
 
 def profile_of(values, deviance):
     bottoms = local_minima(values, deviance)
-    interval, below, above = admitted_interval(values, deviance)
+    interval, below, above = order_interval_95(values, deviance)
     return LikelihoodProfile(
         "lambda", "VII", tuple(values), tuple(deviance), bottoms[0], bottoms, interval, below,
         above, 0.0,
@@ -64,19 +64,19 @@ def test_ripples_do_not_split_a_minimum():
 
 
 def test_curve_below_the_limit_is_open():
-    interval, below, above = admitted_interval(VALUES, (VALUES - 1) ** 2)
+    interval, below, above = order_interval_95(VALUES, (VALUES - 1) ** 2)
     assert (interval, below, above) == ((0.1, 1.9), True, True)
 
 
 def test_the_crossing_of_a_parabola_is_exact():
-    assert limit_crossing(1.0, 3.0, 1.0, 9.0) == pytest.approx(CHI_SQUARE_95**0.5)
+    assert order_at_deviance_limit(1.0, 3.0, 1.0, 9.0) == pytest.approx(CHI_SQUARE_95**0.5)
 
 
 def test_proposed_points_lie_outside_known_ones():
-    proposed = values_outside_known([0.5, 0.9], (0.0, 2.0), 0.2)
+    proposed = orders_outside_known_range([0.5, 0.9], (0.0, 2.0), 0.2)
     assert all(value < 0.5 or value > 0.9 for value in proposed)
     assert (min(proposed), max(proposed)) == pytest.approx((0.1, 1.9))
 
 
 def test_dips_of_a_coarse_curve():
-    assert coarse_minima_values({0.1: 1.0, 0.3: 2.0, 0.5: 1.5, 0.7: 3.0}) == [0.1, 0.5]
+    assert values_at_local_minima({0.1: 1.0, 0.3: 2.0, 0.5: 1.5, 0.7: 3.0}) == [0.1, 0.5]

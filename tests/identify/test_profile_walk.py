@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.deviance_curve import admitted_interval, local_minima
+from analysis.identify.deviance_curve import local_minima, order_interval_95
 from analysis.identify.profile_likelihood import OrderProfiler
 from analysis.models import STRUCTURES
 from analysis.optimizer import NormalEquations
@@ -52,7 +52,7 @@ def test_both_minima_are_found_from_either(start):
     walk.extend_from_other_minima()
     values, found = walk.curve()
     assert local_minima(values, found) == pytest.approx((0.6, 1.4))
-    (low, high), *is_open = admitted_interval(values, found)
+    (low, high), *is_open = order_interval_95(values, found)
     limit = 3.841458820694124
     assert low == pytest.approx(0.6 - WIDTH * limit**0.5, abs=3e-3)
     assert high == pytest.approx(1.4 + WIDTH * (limit - 1) ** 0.5, abs=3e-3)

@@ -27,7 +27,9 @@ def seen(sessions):
         analysis = fit_record(measured, [STRUCTURES["III"]], band_hz=band_hz)
         comparison = analysis.comparison
         scale = comparison.sample_count * comparison.decimation.rate_hz / 2
-        noise = NoiseSpectrum(analysis.noise_nm2_per_hz * scale, analysis.compared, analysis.lines)
+        noise = NoiseSpectrum(
+            analysis.noise_nm2_per_hz * scale, analysis.is_compared, analysis.lines
+        )
         return visible_modes(comparison, noise, analysis.fits[0])
 
     return of

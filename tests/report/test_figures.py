@@ -375,8 +375,10 @@ def test_labels_of_the_uniformity_figure_are_whole(modal_result, with_selection,
     """A frequency that is known to a ten thousandth of a per cent has long numbers at its axis."""
     headline = modal_result.whole.headline
     test = headline.uniform_beam
-    predicted = test.measured + factor * (test.predicted - test.measured)
-    test = replace(test, predicted=predicted, std=factor * test.std)
+    predicted = test.measured_constants + factor * (
+        test.predicted_constants - test.measured_constants
+    )
+    test = replace(test, predicted_constants=predicted, constant_stds=factor * test.constant_stds)
     result = with_selection(modal_result, headline=replace(headline, uniform_beam=test))
     (drawn,) = (each for each in illustrations(result.whole) if each.name == "uniform_beam")
     with style.figure_style():

@@ -145,9 +145,9 @@ def test_the_page_has_a_section_on_the_uniformity(modal_result, page):
 def test_full_turn_of_a_phase_is_no_deviation(modal_result, with_selection):
     headline = modal_result.whole.headline
     at = MODE_CONSTANT_NAMES.index("residue_phase_rad")
-    measured = headline.uniform_beam.measured.copy()
+    measured = headline.uniform_beam.measured_constants.copy()
     measured[at] += 2 * np.pi
-    test = replace(headline.uniform_beam, measured=measured)
+    test = replace(headline.uniform_beam, measured_constants=measured)
     turned = with_selection(modal_result, headline=replace(headline, uniform_beam=test))
     one, other = (
         uniformity_tables(each.whole)[0].rows[at]["deviation_std"].value
