@@ -383,7 +383,7 @@ class _ModalSearch:
             if not (len(search.effect_spectra) or comparison.drag):
                 comparison = comparison.with_reestimated_angle(modal_model, search.noise)
             comparison = comparison.fill_unknown_torque(modal_model)
-            noise_power = smooth_power(residual_spectrum, finely=True)
+            noise_power = smooth_power(residual_spectrum, has_narrow_blocks=True)
             noise_power = noise_power_with_peaks(
                 residual_spectrum,
                 noise_power,

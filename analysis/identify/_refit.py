@@ -15,7 +15,7 @@ from analysis.identify._candidate import Candidate
 from analysis.identify._fit import record_fit_summary
 from analysis.identify._problem import Objective
 from analysis.identify.noise import NoiseSpectrum, smooth_power
-from analysis.identify.parametrization import VANISHING_LOSS, StepRule
+from analysis.identify.parametrization import VANISHING_LOSS_FACTOR, StepRule
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -87,7 +87,7 @@ class Refit:
         `relative_tolerance` is that of `analysis.optimizer.descend`, and `give_up_condition` its
         `early_stop_limits`. With `max_evaluations` of 1 the start is only evaluated.
         """
-        step_rule = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
+        step_rule = StepRule.for_unknowns(unknowns, VANISHING_LOSS_FACTOR)
         x = np.clip(start_vector, step_rule.lower, step_rule.upper)
         for fixed_name in fixed_unknowns:
             fixed_index = unknowns.names.index(fixed_name)
@@ -111,7 +111,7 @@ class Refit:
         objective, minimum = self.objective.find_minimum(
             self.x,
             self.noise.weight,
-            StepRule.for_unknowns(self.objective.unknowns, VANISHING_LOSS),
+            StepRule.for_unknowns(self.objective.unknowns, VANISHING_LOSS_FACTOR),
             relative_tolerance=_COST_TOLERANCE,
             max_evaluations=max_evaluations,
         )

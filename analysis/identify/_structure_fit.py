@@ -139,7 +139,7 @@ def fit_structure(
     )
     unknowns = StructureUnknowns(
         structure,
-        undamped_unknowns.nominal,
+        undamped_unknowns.nominal_plant,
         undamped_unknowns.free_settings,
         undamped_unknowns.omega_rad_s,
         comparison.poles(best_candidate.fit.plant),

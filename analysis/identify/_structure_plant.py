@@ -141,7 +141,7 @@ class StructureUnknowns(Unknowns):
     @cached_property
     def setting_unknowns(self) -> Unknowns:
         """Return the unknowns of beam and rig alone, which come after those of the structure."""
-        return Unknowns(UNDAMPED, self.nominal, self.free_settings, self.omega_rad_s)
+        return Unknowns(UNDAMPED, self.nominal_plant, self.free_settings, self.omega_rad_s)
 
     @property
     def _free_parameters(self) -> list[Parameter]:

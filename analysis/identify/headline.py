@@ -368,7 +368,7 @@ def headline_of_fit(
     fit_with_both_dampings : tuple of (RecordFit, bool), optional
         Result of `CandidateSet.fit_with_both_dampings`: the fit with both dampings, for the modes.
     """
-    with_both, uses_both = fit_with_both_dampings or (fit, False)
+    fit_with_both, uses_both = fit_with_both_dampings or (fit, False)
     damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
     if SECOND_DAMPING_REASON in order_reasons.values():
         damping_reason = SECOND_DAMPING_REASON
@@ -411,10 +411,12 @@ def headline_of_fit(
         modes=tuple(
             _reported_mode(mode_estimate, visible_numbers, unexplained_reason)
             for mode_estimate in (
-                _modes_with_wider_uncertainty(fit, with_both) if uses_both else with_both.modes
+                _modes_with_wider_uncertainty(fit, fit_with_both)
+                if uses_both
+                else fit_with_both.modes
             )
         ),
-        with_both=with_both,
+        with_both=fit_with_both,
         structures=((name, "selected"),),
         simpler=None,
         drag_speed_m_s=None,
@@ -557,12 +559,14 @@ def reported_loss_factor(
     )
 
 
-def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
+def _modes_with_wider_uncertainty(
+    fit: RecordFit, fit_with_both: RecordFit
+) -> Iterator[ModeEstimate]:
     """Yield the modes of a fit, with the standard deviations of a fit with both dampings.
 
     These are larger, since the second damping is free.
     """
-    modes_with_both = {mode.number: mode for mode in with_both.modes}
+    modes_with_both = {mode.number: mode for mode in fit_with_both.modes}
     for mode in fit.modes:
         mode_with_both = modes_with_both.get(mode.number, mode)
         yield replace(

@@ -74,12 +74,12 @@ _EstimatesT = TypeVar("_EstimatesT", bound=Estimates)
 
 
 def replace_by_modal_model(
-    exact: _EstimatesT,
+    exact_headline: _EstimatesT,
     modal: ModalEstimate,
     test: UniformBeamTest,
     tolerant: TolerantEstimate | None,
-    doubt: str | None,
-    mode_doubt: str | None,
+    doubt_reason: str | None,
+    mode_doubt_reason: str | None,
     *,
     half_width: float = NORMAL_95,
 ) -> _EstimatesT:
@@ -89,25 +89,32 @@ def replace_by_modal_model(
 
     Parameters
     ----------
-    exact : Estimates
+    exact_headline : Estimates
         Estimates for an exactly uniform beam.
     modal : ModalEstimate
         Modal model.
     test : UniformBeamTest
         Test of a uniform beam against the modal model.
     tolerant : TolerantEstimate or None
-        Parameters of a beam with a tolerance of the geometry. With None the parameters of `exact`
-        are retained: the beam is stated to be uniform, or too few modes are visible.
-    doubt, mode_doubt : str or None
+        Parameters of a beam with a tolerance of the geometry. With None the parameters of
+        `exact_headline` are retained: the beam is stated to be uniform, or too few modes are
+        visible.
+    doubt_reason, mode_doubt_reason : str or None
         Reason against every number of the record, and against every mode.
     half_width : float
         Half width of the modes' 95 % intervals, in standard deviations.
     """
     refusal = uniform_beam_refusal_reason(test)
-    exact_estimates = exact if refusal is None else exact.with_flag_on_all(refusal)
+    exact_estimates = (
+        exact_headline if refusal is None else exact_headline.with_flag_on_all(refusal)
+    )
     # The effect of drag depends on how a mode decays, which the beam model includes.
-    modes_of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
-    modes = _reported_modes(exact_estimates, modal, mode_doubt, half_width, from_beam=modes_of_beam)
+    modes_of_beam = test.status == "passed" and (
+        tolerant is None or "drag" in exact_headline.parameters
+    )
+    modes = _reported_modes(
+        exact_estimates, modal, mode_doubt_reason, half_width, from_beam=modes_of_beam
+    )
     estimates = replace(exact_estimates, modes=modes, uniform_beam=test, modal=modal)
     if tolerant is None:
         return estimates
@@ -119,10 +126,10 @@ def replace_by_modal_model(
                 for parameter_name, parameter_value in exact_estimates.parameters.items()
                 if parameter_name not in PARAMETERS
             },
-            **_reported_parameters(tolerant, doubt, refused=refusal is not None),
+            **_reported_parameters(tolerant, doubt_reason, refused=refusal is not None),
         },
         sizes=tuple(
-            loss_factor_found.with_flag(doubt)
+            loss_factor_found.with_flag(doubt_reason)
             for loss_factor_found in loss_factors_with_geometry_tolerance(test, tolerant)
         ),
         structures=_structure_status(exact_estimates, tolerant),
@@ -213,7 +220,7 @@ def _flag_contradicted(estimate: Estimate, rivals: Sequence[tuple[float, str]]) 
 def _reported_modes(
     estimates: Estimates,
     modal: ModalEstimate,
-    doubt: str | None,
+    doubt_reason: str | None,
     half_width: float,
     *,
     from_beam: bool,
@@ -222,25 +229,25 @@ def _reported_modes(
 
     With `from_beam`, frequency and damping ratio of visible modes are also those of the beam.
     """
-    visible = modal.visible_mode_numbers
+    visible_numbers = modal.visible_mode_numbers
     modes_by_number: dict[int, ReportedMode] = {
         mode_estimate.number: mode_estimate for mode_estimate in estimates.modes
     }
-    for mode_number in visible:
+    for mode_number in visible_numbers:
         modal_mode = modal.mode(mode_number)
         inertia_kg_m2, relative_std = modal.effective_inertia(mode_number)
         mode_estimate = ReportedMode(
             mode_number,
             symmetric_value(
-                modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt, half_width
+                modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt_reason, half_width
             ),
             symmetric_value(
-                modal_mode.damping_ratio, modal_mode.damping_ratio_std, doubt, half_width
+                modal_mode.damping_ratio, modal_mode.damping_ratio_std, doubt_reason, half_width
             ),
             shown=True,
             source="modal",
             participation=symmetric_value(
-                inertia_kg_m2, inertia_kg_m2 * relative_std, doubt, half_width
+                inertia_kg_m2, inertia_kg_m2 * relative_std, doubt_reason, half_width
             ),
         )
         if from_beam and mode_number in modes_by_number:
@@ -250,27 +257,29 @@ def _reported_modes(
             )
         modes_by_number[mode_number] = mode_estimate
     return tuple(
-        reported_mode if reported_mode.number in visible else replace(reported_mode, shown=False)
+        reported_mode
+        if reported_mode.number in visible_numbers
+        else replace(reported_mode, shown=False)
         for _, reported_mode in sorted(modes_by_number.items())
     )
 
 
 def _reported_parameters(
-    estimate: TolerantEstimate, doubt: str | None, *, refused: bool
+    estimate: TolerantEstimate, doubt_reason: str | None, *, refused: bool
 ) -> dict[str, Estimate]:
     """Return the parameters of the beam with a tolerance of the geometry, flagged if undetermined.
 
-    `doubt` is the reason to doubt every number. With `refused`, stiffness, density, delay and
-    external damping are effective values: a tip mass or a compliant clamp changes all modes alike,
-    by far more than the tolerance. Internal damping is an effective value if its order was fitted
-    to the frequencies.
+    `doubt_reason` is the reason to doubt every number. With `refused`, stiffness, density, delay
+    and external damping are effective values: a tip mass or a compliant clamp changes all modes
+    alike, by far more than the tolerance. Internal damping is an effective value if its order was
+    fitted to the frequencies.
     """
     return {
         parameter_name: Estimate(
             estimate.values[parameter_name],
             estimate.std[parameter_name],
             estimate.interval[parameter_name],
-            doubt
+            doubt_reason
             or effective_reason(estimate, parameter_name, refused=refused)
             or _reason_undetermined(estimate, parameter_name),
         )

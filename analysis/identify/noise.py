@@ -32,18 +32,18 @@ _PEAK_POWER_RATIO: Final = 2.4
 """Mean power over `_PEAK_BINS` bins, relative to the smooth power, that chance exceeds in one
 record of a hundred."""
 
-_MEDIAN_OVER_MEAN: Final = float(np.log(2.0))
+_MEDIAN_TO_MEAN_POWER_RATIO: Final = float(np.log(2.0))
 """Median over mean of an exponentially distributed power."""
 
 _LINE_POWER_RATIO: Final = 20.0
 """Power over that of the noise from which a bin is significant. Chance exceeds it once in 5e8
 bins."""
 
-_DURATION_BINS: Final = 16
+_LINE_SURROUNDING_BINS: Final = 16
 """Number of bins to either side of a line that resolve its duration: parts of 1/32 of the
 record."""
 
-_RECORD_PARTS: Final = 8
+_RECORD_PART_COUNT: Final = 8
 """Number of parts of the record in which the power of a line is compared."""
 
 _MIN_PART_POWER_RATIO: Final = 0.3
@@ -167,7 +167,9 @@ def estimate_noise(
     return NoiseSpectrum(noise_power, is_compared, tuple(noise_lines))
 
 
-def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> NDArray[np.float64]:
+def smooth_power(
+    residual: NDArray[np.complex128], *, has_narrow_blocks: bool = False
+) -> NDArray[np.float64]:
     """Return the smooth power ``|residual|²`` of a residual spectrum, shape (K,).
 
     The power of noise in one bin is exponentially distributed, so its mean is the median over ln 2.
@@ -179,16 +181,21 @@ def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> N
     ----------
     residual : ndarray of complex, shape (K,)
         Spectrum of the residual on neighbouring bins.
-    finely : bool
+    has_narrow_blocks : bool
         Whether all blocks are narrow. Narrow blocks follow a peak of the noise.
     """
     bin_power = residual.real**2 + residual.imag**2
     block_edges = (
-        _narrow_block_borders(bin_power.size) if finely else _block_borders(bin_power.size)
+        _narrow_block_borders(bin_power.size)
+        if has_narrow_blocks
+        else _block_borders(bin_power.size)
     )
     ln_power = np.array(
         [
-            np.log(max(float(np.median(bin_power[a:b])), np.finfo(float).tiny) / _MEDIAN_OVER_MEAN)
+            np.log(
+                max(float(np.median(bin_power[a:b])), np.finfo(float).tiny)
+                / _MEDIAN_TO_MEAN_POWER_RATIO
+            )
             for a, b in itertools.pairwise(block_edges)
         ]
     )
@@ -203,7 +210,7 @@ def noise_power_with_peaks(
     residual: NDArray[np.complex128],
     smooth_noise_power: NDArray[np.float64],
     is_peak_allowed: NDArray[np.bool_],
-    may_continue: NDArray[np.bool_] | None = None,
+    may_peak_continue: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
     """Return the noise power of each bin, with peaks narrower than the smoothing blocks, (K,).
 
@@ -215,7 +222,7 @@ def noise_power_with_peaks(
         Smooth power of the residual, as `smooth_power` returns it.
     is_peak_allowed : ndarray of bool, shape (K,)
         True for bins at which a peak is possible.
-    may_continue : ndarray of bool, shape (K,), optional
+    may_peak_continue : ndarray of bool, shape (K,), optional
         True for bins to which a peak may continue from a neighbouring bin.
     """
     power_ratio = (residual.real**2 + residual.imag**2) / smooth_noise_power
@@ -224,9 +231,9 @@ def noise_power_with_peaks(
     is_peak = (
         np.convolve(local_ratio > _PEAK_POWER_RATIO, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
     )
-    if may_continue is not None:
+    if may_peak_continue is not None:
         is_peak_allowed = is_peak_allowed | _connected_bins(
-            is_peak & is_peak_allowed, is_peak & may_continue
+            is_peak & is_peak_allowed, is_peak & may_peak_continue
         )
     return np.where(
         is_peak & is_peak_allowed,
@@ -242,8 +249,8 @@ def _connected_bins(
     is_connected = is_start | may_continue
     run_numbers = np.cumsum(np.diff(is_connected, prepend=False) & is_connected)
     has_start = np.bincount(run_numbers[is_start], minlength=run_numbers[-1] + 1) > 0
-    connected_mask: NDArray[np.bool_] = is_connected & has_start[run_numbers]
-    return connected_mask
+    is_connected_to_start: NDArray[np.bool_] = is_connected & has_start[run_numbers]
+    return is_connected_to_start
 
 
 def _block_borders(bin_count: int) -> NDArray[np.intp]:
@@ -282,10 +289,13 @@ def _find_line_groups(
     A line leaks into its neighbours as 1 / distance: at three times the distance at which it is
     significant the leakage is below the noise.
     """
-    loud_bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE_POWER_RATIO * noise_power)
-    if loud_bins.size == 0:
+    bins_above_noise = np.flatnonzero(np.abs(residual) ** 2 > _LINE_POWER_RATIO * noise_power)
+    if bins_above_noise.size == 0:
         return []
-    bin_groups = np.split(loud_bins, np.flatnonzero(np.diff(loud_bins) > _DURATION_BINS // 2) + 1)
+    bin_groups = np.split(
+        bins_above_noise,
+        np.flatnonzero(np.diff(bins_above_noise) > _LINE_SURROUNDING_BINS // 2) + 1,
+    )
     groups_with_skirts = []
     for bin_group in bin_groups:
         first_bin, last_bin = int(bin_group[0]), int(bin_group[-1])
@@ -301,9 +311,9 @@ def _lasts_through_record(residual: NDArray[np.complex128], line_bins: slice) ->
     decays.
     """
     bins_around = residual[
-        max(line_bins.start - _DURATION_BINS, 0) : line_bins.stop + _DURATION_BINS
+        max(line_bins.start - _LINE_SURROUNDING_BINS, 0) : line_bins.stop + _LINE_SURROUNDING_BINS
     ]
-    padded_length = _RECORD_PARTS * (-(-4 * bins_around.size // _RECORD_PARTS))
+    padded_length = _RECORD_PART_COUNT * (-(-4 * bins_around.size // _RECORD_PART_COUNT))
     power_envelope = np.abs(np.fft.ifft(bins_around, padded_length)) ** 2
-    mean_power_of_eighths = power_envelope.reshape(_RECORD_PARTS, -1).mean(axis=1)
+    mean_power_of_eighths = power_envelope.reshape(_RECORD_PART_COUNT, -1).mean(axis=1)
     return bool(mean_power_of_eighths.min() > _MIN_PART_POWER_RATIO * mean_power_of_eighths.mean())

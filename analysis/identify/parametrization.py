@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 # Unknowns
 
-_LN_BEAM_HALF_RANGE: Final = math.log(3.0)
+_LN_BEAM_PARAMETER_HALF_RANGE: Final = math.log(3.0)
 """Largest change of ln(rho/EI) and ln(EI) from the nominal beam: a factor of 3."""
 
 _DELAY_UNIT_S: Final = 1e-3
@@ -59,7 +59,7 @@ _DELAY_RANGE_S: Final = 0.02
 _QUARTER_TURN_RAD: Final = math.pi / 2
 """Phase of ``s^1`` on the imaginary axis, in radians."""
 
-_LOSS_OF_NEW_DAMPING: Final = 1e-5
+_LOSS_FACTOR_OF_NEW_DAMPING: Final = 1e-5
 """Loss, relative to stiffness or inertia, at which a fit starts with a damping that was absent."""
 
 
@@ -71,7 +71,7 @@ class Unknowns:
     ----------
     structure : Structure
         Damping structure.
-    nominal : Plant
+    nominal_plant : Plant
         Source of the values that are not free. Its damping is not used.
     free_settings : tuple of str
         Free settings, in the order of `SETTINGS`.
@@ -80,13 +80,13 @@ class Unknowns:
     """
 
     structure: Structure
-    nominal: Plant
+    nominal_plant: Plant
     free_settings: tuple[Setting, ...]
     omega_rad_s: tuple[float, float]
 
     @classmethod
     def for_structure(
-        cls, structure: Structure, nominal: Plant, free_settings: tuple[Setting, ...]
+        cls, structure: Structure, nominal_plant: Plant, free_settings: tuple[Setting, ...]
     ) -> Unknowns:
         """Return the unknowns of a structure with some settings of the rig free.
 
@@ -94,18 +94,20 @@ class Unknowns:
         ----------
         structure : Structure
             Structure that states which damping parameters are free.
-        nominal : Plant
+        nominal_plant : Plant
             Beam and rig as the file states them.
         free_settings : tuple of str
             Names of the settings that are estimated.
         """
         first_omega_rad_s, second_omega_rad_s = map(
-            float, undamped_frequencies_rad_s(nominal.beam, 2)
+            float, undamped_frequencies_rad_s(nominal_plant.beam, 2)
         )
         ordered_settings = tuple(
             setting_name for setting_name in SETTINGS if setting_name in free_settings
         )
-        return cls(structure, nominal, ordered_settings, (first_omega_rad_s, second_omega_rad_s))
+        return cls(
+            structure, nominal_plant, ordered_settings, (first_omega_rad_s, second_omega_rad_s)
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -130,8 +132,14 @@ class Unknowns:
             "alpha": ORDER_RANGE,
             "gamma": ln_size_range,
             "lambda": ORDER_RANGE,
-            "density_over_stiffness": (-_LN_BEAM_HALF_RANGE, _LN_BEAM_HALF_RANGE),
-            "bending_stiffness_n_m2": (-_LN_BEAM_HALF_RANGE, _LN_BEAM_HALF_RANGE),
+            "density_over_stiffness": (
+                -_LN_BEAM_PARAMETER_HALF_RANGE,
+                _LN_BEAM_PARAMETER_HALF_RANGE,
+            ),
+            "bending_stiffness_n_m2": (
+                -_LN_BEAM_PARAMETER_HALF_RANGE,
+                _LN_BEAM_PARAMETER_HALF_RANGE,
+            ),
             "delay_s": (-largest_scaled_delay, largest_scaled_delay),
             "tool_inertia_kg_m2": (0.0, 1.0),
         }
@@ -153,7 +161,7 @@ class Unknowns:
             **dict(zip(self.structure.free, damping_sizes.tolist(), strict=True)),
             "density_over_stiffness": 0.0,
             "bending_stiffness_n_m2": 0.0,
-            **self._linear_unknowns(self.nominal),
+            **self._linear_unknowns(self.nominal_plant),
         }
         for damping_coefficient, order_name in (("zeta", "alpha"), ("gamma", "lambda")):
             if damping_coefficient in self.names:
@@ -172,7 +180,7 @@ class Unknowns:
             order, the damping keeps its loss at the mode. Absent damping starts small, with order
             1.
         """
-        damping, nominal_beam = plant.damping, self.nominal.beam
+        damping, nominal_beam = plant.damping, self.nominal_plant.beam
         first_omega_rad_s, second_omega_rad_s = self.omega_rad_s
         density_over_stiffness = plant.beam.density_over_stiffness
         ln_ratio = math.log(density_over_stiffness / nominal_beam.density_over_stiffness)
@@ -180,9 +188,9 @@ class Unknowns:
             plant.beam.bending_stiffness_n_m2 / nominal_beam.bending_stiffness_n_m2
         )
         unknown_values = {
-            "zeta": math.log(_LOSS_OF_NEW_DAMPING),
+            "zeta": math.log(_LOSS_FACTOR_OF_NEW_DAMPING),
             "alpha": 1.0,
-            "gamma": math.log(_LOSS_OF_NEW_DAMPING),
+            "gamma": math.log(_LOSS_FACTOR_OF_NEW_DAMPING),
             "lambda": 1.0,
         }
         unknown_values |= self._linear_unknowns(plant)
@@ -226,17 +234,19 @@ class Unknowns:
         }
         return np.array([unknown_values[parameter_name] for parameter_name in self.names])
 
-    def plant(self, x: NDArray[np.float64]) -> Plant:
+    def plant(self, vector_of_unknowns: NDArray[np.float64]) -> Plant:
         """Return the plant that a vector of unknowns describes."""
-        return self._plant_of(self._values_and_derivatives(x)[0])
+        return self._plant_of(self._values_and_derivatives(vector_of_unknowns)[0])
 
-    def plant_and_gradient(self, x: NDArray[np.float64]) -> tuple[Plant, NDArray[np.float64]]:
+    def plant_and_gradient(
+        self, vector_of_unknowns: NDArray[np.float64]
+    ) -> tuple[Plant, NDArray[np.float64]]:
         """Return the plant for a vector of unknowns, and the derivatives of its parameters.
 
         The derivatives have the shape (k, k): [parameter, unknown]. The parameters are
         `gradient_names`, where zeta and gamma are not logarithms.
         """
-        parameter_values, parameter_slopes = self._values_and_derivatives(x)
+        parameter_values, parameter_slopes = self._values_and_derivatives(vector_of_unknowns)
         for unknown_index, parameter_name in enumerate(self.names):
             if parameter_name in ("zeta", "gamma"):
                 parameter_slopes[unknown_index] *= parameter_values[parameter_name]
@@ -245,11 +255,11 @@ class Unknowns:
     def _plant_of(self, parameter_values: Mapping[str, float]) -> Plant:
         """Return the rig and beam for values of all parameters, by name."""
         names = (*DAMPING_PARAMETERS, *SETTINGS)
-        return self.nominal.with_parameters({name: parameter_values[name] for name in names})
+        return self.nominal_plant.with_parameters({name: parameter_values[name] for name in names})
 
-    def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
+    def parameters(self, vector_of_unknowns: NDArray[np.float64]) -> dict[str, float]:
         """Return all plant parameters by name, free and fixed, for a vector of unknowns."""
-        return self.plant(x).parameters
+        return self.plant(vector_of_unknowns).parameters
 
     @cached_property
     def units(self) -> Mapping[str, float]:
@@ -257,7 +267,7 @@ class Unknowns:
 
         The tool inertia is that between torque sensor and beam.
         """
-        nominal_beam = self.nominal.beam
+        nominal_beam = self.nominal_plant.beam
         unknown_units = {
             "delay_s": _DELAY_UNIT_S,
             "tool_inertia_kg_m2": nominal_beam.inertia_kg_m2,
@@ -273,7 +283,7 @@ class Unknowns:
     def _fixed_values(self) -> Mapping[str, float]:
         """Return nominal settings and fixed damping parameters, by name."""
         fixed_values = dict(self.structure.fixed.items())
-        return MappingProxyType({**self.nominal.parameters, **fixed_values})
+        return MappingProxyType({**self.nominal_plant.parameters, **fixed_values})
 
     def _linear_unknowns(self, plant: Plant) -> dict[str, float]:
         """Return delay and tool inertia of a plant, divided by `units`, by name."""
@@ -283,29 +293,31 @@ class Unknowns:
             for parameter_name, unknown_unit in self.units.items()
         }
 
-    def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def estimates_by_unknowns(self, vector_of_unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the derivatives of the free parameters by the unknowns, shape (k, k).
 
         The indices are [parameter, unknown]. Parameters in `LOGARITHMIC_PARAMETERS` count as
         logarithms.
         """
-        parameter_slopes: NDArray[np.float64] = self._values_and_derivatives(x)[1]
+        parameter_slopes: NDArray[np.float64] = self._values_and_derivatives(vector_of_unknowns)[1]
         return parameter_slopes
 
     def _values_and_derivatives(
-        self, x: NDArray[np.float64]
+        self, vector_of_unknowns: NDArray[np.float64]
     ) -> tuple[dict[str, float], NDArray[np.float64]]:
         """Return all plant parameters by name, and their derivatives by the unknowns.
 
         The derivatives are those of `estimates_by_unknowns`.
         """
         unknown_indices = self._indices
-        unknown_values: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
+        unknown_values: dict[str, float] = dict(
+            zip(self.names, vector_of_unknowns.tolist(), strict=True)
+        )
         parameter_values: dict[str, float] = dict(self._fixed_values)
-        parameter_slopes = np.eye(x.size)
+        parameter_slopes = np.eye(vector_of_unknowns.size)
         first_omega_rad_s, second_omega_rad_s = self.omega_rad_s
         # ln of the factor by which damping changes stiffness and inertia, with its derivatives.
-        stiffness_change, inertia_change = np.zeros((2, x.size + 1))
+        stiffness_change, inertia_change = np.zeros((2, vector_of_unknowns.size + 1))
         if self.structure.has_internal_damping:
             parameter_values["alpha"] = damping_order = unknown_values.get(
                 "alpha", parameter_values["alpha"]
@@ -378,12 +390,18 @@ class Unknowns:
         """
         signed_size, order_phase_rad = term_sign * math.exp(ln_size), _QUARTER_TURN_RAD * order
         squared_factor = 1 + 2 * signed_size * math.cos(order_phase_rad) + signed_size * signed_size
-        by_ln_size = signed_size * (math.cos(order_phase_rad) + signed_size) / squared_factor
+        derivative_by_ln_size = (
+            signed_size * (math.cos(order_phase_rad) + signed_size) / squared_factor
+        )
         derivatives_and_value = np.zeros(len(self.names) + 1)
-        derivatives_and_value[self._indices[loss_name]] = by_ln_size
+        derivatives_and_value[self._indices[loss_name]] = derivative_by_ln_size
         if order_name in self._indices:
-            by_phase = -_QUARTER_TURN_RAD * signed_size * math.sin(order_phase_rad) / squared_factor
-            derivatives_and_value[self._indices[order_name]] = by_ln_size * ln_size_slope + by_phase
+            derivative_by_phase = (
+                -_QUARTER_TURN_RAD * signed_size * math.sin(order_phase_rad) / squared_factor
+            )
+            derivatives_and_value[self._indices[order_name]] = (
+                derivative_by_ln_size * ln_size_slope + derivative_by_phase
+            )
         derivatives_and_value[-1] = math.log(squared_factor) / 2
         return derivatives_and_value
 
@@ -401,7 +419,7 @@ def _ln_damping_size(ln_loss: float, order: float) -> tuple[float, float]:
 _MAX_ORDER_STEP_FRACTION: Final = 0.5
 """Longest step of an order, as a fraction of its distance to 0 or 2."""
 
-VANISHING_LOSS: Final = 1e-4
+VANISHING_LOSS_FACTOR: Final = 1e-4
 """Loss, relative to stiffness or inertia, below which one step may remove the damping."""
 
 _MAX_GROWTH_EXPONENT: Final = 50.0
@@ -462,50 +480,58 @@ class StepRule:
         return cls(*unknowns.bounds, damping_indices, loss_indices, linear_loss_limit)
 
     def step_limits(
-        self, x: NDArray[np.float64]
+        self, vector_of_unknowns: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the smallest and largest admissible step of each unknown, each of shape (k,).
 
         An order approaches 0 and 2 by a fraction of its distance at a time: the effect of damping
         depends on the logarithm of that distance. The order of a vanished damping is constant.
         """
-        smallest_steps, largest_steps = self.lower - x, self.upper - x
+        smallest_steps, largest_steps = (
+            self.lower - vector_of_unknowns,
+            self.upper - vector_of_unknowns,
+        )
         for loss_index, order_index, _ in self.damping_indices:
-            step_fraction = (
-                _MAX_ORDER_STEP_FRACTION if x[loss_index] > self.lower[loss_index] else 0.0
+            order_step_fraction = (
+                _MAX_ORDER_STEP_FRACTION
+                if vector_of_unknowns[loss_index] > self.lower[loss_index]
+                else 0.0
             )
             smallest_steps[order_index] = max(
-                smallest_steps[order_index], -step_fraction * x[order_index]
+                smallest_steps[order_index], -order_step_fraction * vector_of_unknowns[order_index]
             )
             largest_steps[order_index] = min(
-                largest_steps[order_index], step_fraction * (2 - x[order_index])
+                largest_steps[order_index],
+                order_step_fraction * (2 - vector_of_unknowns[order_index]),
             )
         return smallest_steps, largest_steps
 
     def end_point(
-        self, x: NDArray[np.float64], unknown_step: NDArray[np.float64]
+        self, vector_of_unknowns: NDArray[np.float64], unknown_step: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the unknowns after a step along the curve, within the bounds, shape (k,).
 
         Parameters
         ----------
-        x : ndarray, shape (k,)
+        vector_of_unknowns : ndarray, shape (k,)
             Unknowns before the step.
         unknown_step : ndarray, shape (k,)
-            Step within the `step_limits`, tangent to the curve at `x`.
+            Step within the `step_limits`, tangent to the curve at `vector_of_unknowns`.
         """
-        end = np.clip(x + unknown_step, self.lower, self.upper)
+        bounded_end = np.clip(vector_of_unknowns + unknown_step, self.lower, self.upper)
         for i in self.loss_indices:
-            if unknown_step[i] > 0 and math.exp(x[i]) < self.linear_loss_limit:
-                end[i] = min(x[i] + math.log1p(unknown_step[i]), self.upper[i])
+            if unknown_step[i] > 0 and math.exp(vector_of_unknowns[i]) < self.linear_loss_limit:
+                bounded_end[i] = min(
+                    vector_of_unknowns[i] + math.log1p(unknown_step[i]), self.upper[i]
+                )
         for i, j, adds_stiffness in self.damping_indices:
             if unknown_step[i] != 0:
                 phase_before, phase_after = (
-                    _phase_of_order(x[j], adds_stiffness),
-                    _phase_of_order(end[j], adds_stiffness),
+                    _phase_of_order(vector_of_unknowns[j], adds_stiffness),
+                    _phase_of_order(bounded_end[j], adds_stiffness),
                 )
                 largest_loss = math.exp(self.upper[i])
-                loss_factor = math.exp(x[i])
+                loss_factor = math.exp(vector_of_unknowns[i])
                 is_linear = loss_factor < self.linear_loss_limit
                 loss_factor, phase_rad = _loss_and_phase_after_step(
                     loss_factor,
@@ -515,10 +541,10 @@ class StepRule:
                     largest_loss,
                     is_linear=is_linear,
                 )
-                end[i] = math.log(loss_factor) if loss_factor > 0 else self.lower[i]
+                bounded_end[i] = math.log(loss_factor) if loss_factor > 0 else self.lower[i]
                 if phase_rad != phase_after:
-                    end[j] = _order_of_phase(phase_rad, adds_stiffness)
-        bounded_unknowns: NDArray[np.float64] = np.clip(end, self.lower, self.upper)
+                    bounded_end[j] = _order_of_phase(phase_rad, adds_stiffness)
+        bounded_unknowns: NDArray[np.float64] = np.clip(bounded_end, self.lower, self.upper)
         return bounded_unknowns
 
 
@@ -542,7 +568,7 @@ def _loss_and_phase_after_step(
     ln_tan_step = (
         ln_loss_step + pivot_loss_factor / math.sin(phase_before) * (phase_after - phase_before)
     ) / math.hypot(real_part, loss_factor)
-    if ln_tan_step <= -1 and loss_factor < VANISHING_LOSS:
+    if ln_tan_step <= -1 and loss_factor < VANISHING_LOSS_FACTOR:
         return (
             0.0,
             phase_after,

@@ -208,7 +208,7 @@ def profile(
 _BOTH_ORDERS: Final[tuple[OrderName, OrderName]] = ("alpha", "lambda")
 """Orders of internal and external damping, as they are returned."""
 
-_MAX_ROUNDS: Final = 3
+_MAX_PROFILE_ROUNDS: Final = 3
 """Largest number of times that both profiles are computed."""
 
 
@@ -236,7 +236,7 @@ def profile_both_orders(
     alpha, lambda_ : LikelihoodProfile
         Profiles of both orders.
     """
-    for round_index in range(1, _MAX_ROUNDS + 1):
+    for round_index in range(1, _MAX_PROFILE_ROUNDS + 1):
         freest_candidate = candidate_set.freest
         # The order of an insignificant damping is undetermined: no profile would help.
         profiles = {
@@ -247,7 +247,7 @@ def profile_both_orders(
             if compute and freest_candidate.structure.has_damping_of(order)
         }
         costs_before = [candidate.fit.cost for candidate in candidate_set.candidates]
-        if round_index == _MAX_ROUNDS:
+        if round_index == _MAX_PROFILE_ROUNDS:
             break
         for profile_fit in profiles.values():
             if _may_improve(candidate_set, profile_fit):
@@ -287,7 +287,7 @@ def _may_improve(candidate_set: CandidateSet, profile_fit: ProfileWithPlants) ->
 _MAX_PROFILE_DEVIANCE: Final = 25.0
 """Deviance up to which the order is varied. The 95 % limit is 3.84."""
 
-_OVERSHOOT_FACTOR: Final = 1.04
+_STEP_OVERSHOOT_FACTOR: Final = 1.04
 """Factor by which a step goes beyond the value at which the deviance should reach its level."""
 
 _DEFAULT_ORDER_STD: Final = 0.02
@@ -312,7 +312,7 @@ the limit."""
 _MAX_LIMIT_REFITS: Final = 2
 """Largest number of refits that narrow down the value at the 95 % limit."""
 
-_DOUBTFUL_FRACTION: Final = 0.025
+_DOUBTFUL_INTERVAL_FRACTION: Final = 0.025
 """Admitted fraction of the range 0 to 2 from which another local minimum is searched for."""
 
 _TRIAL_ORDER_SPACING: Final = 0.2
@@ -423,7 +423,7 @@ class OrderProfiler:
         Extend the profile from each of them.
         """
         (lower_end, upper_end), open_below, open_above = order_interval_95(*self.curve())
-        is_interval_wide = upper_end - lower_end > _DOUBTFUL_FRACTION * (
+        is_interval_wide = upper_end - lower_end > _DOUBTFUL_INTERVAL_FRACTION * (
             ORDER_RANGE[1] - ORDER_RANGE[0]
         )
         trial_orders = orders_outside_known_range(
@@ -451,11 +451,13 @@ class OrderProfiler:
                 hopeless=(_TRIAL_EVALUATIONS, highest_cost),
             )
             order_values, deviances = self.curve()
-            at = float(refined_fit.x[self._order_index])
+            order_at_minimum = float(refined_fit.x[self._order_index])
             minimum_deviance = self._value_count * math.log(
                 refined_fit.cost / min(self.costs.values())
             )
-            known_deviance = float(np.interp(at, order_values, deviances, math.inf, math.inf))
+            known_deviance = float(
+                np.interp(order_at_minimum, order_values, deviances, math.inf, math.inf)
+            )
             if minimum_deviance < min(CHI_SQUARE_95, known_deviance - MIN_BARRIER_DEVIANCE):
                 self._start_at(refined_fit)
                 self.extend_both_ways()
@@ -465,7 +467,7 @@ class OrderProfiler:
         if refit.cost < self.costs.get(order_value, math.inf):
             self.costs[order_value], self._refits[order_value] = refit.cost, refit
 
-    def _extend(self, direction: float) -> None:
+    def _extend(self, direction_sign: float) -> None:
         """Extend the profile in one direction until the record excludes the values beyond.
 
         Then refine the value at which the deviance crosses the 95 % limit.
@@ -479,7 +481,8 @@ class OrderProfiler:
         ):
             nearest_refit = self._refits[order_value]
             order_value = min(
-                max(self._minimum_order + direction * order_distance, smallest_order), largest_order
+                max(self._minimum_order + direction_sign * order_distance, smallest_order),
+                largest_order,
             )
             deviance_root = self._refit_at(order_value, nearest_refit)
             if deviance_root**2 < CHI_SQUARE_95:
@@ -490,7 +493,7 @@ class OrderProfiler:
                     _MAX_PROFILE_DEVIANCE,
                 )
             distance_growth = (
-                _OVERSHOOT_FACTOR * math.sqrt(target_deviance) / max(deviance_root, 1e-3)
+                _STEP_OVERSHOOT_FACTOR * math.sqrt(target_deviance) / max(deviance_root, 1e-3)
             )
             order_distance *= min(max(distance_growth, _MIN_DISTANCE_GROWTH), _MAX_DISTANCE_GROWTH)
         for _ in range(_MAX_LIMIT_REFITS if outside_order is not None else 0):

@@ -47,7 +47,7 @@ _DOUBTFUL_PROBABILITY: Final = 0.01
 """Probability of chance below which a residual is doubtful. A false alarm costs only computing time
 there."""
 
-_LOUD_POWER_RATIOS: Final = {8: 5.0, 32: 2.6}
+_MIN_LOUD_POWER_RATIO_BY_BINS: Final = {8: 5.0, 32: 2.6}
 """Power over that of the noise from which a window of 8 or 32 bins is loud. One record of white
 noise in 5000 has such a window (of 12 000 records with the noise estimated from medians of 60
 bins). Such an estimate is uncertain by up to 18 %: with the limits for a noise that is known
@@ -59,7 +59,7 @@ _COHERENT_BINS: Final = 9
 _DRIVEN_POWER_RATIO: Final = 0.1
 """Power of the angle, relative to the mean around it, from which a bin counts as driven."""
 
-_RESIDUAL_LIMIT: Final = 4.0
+_MAX_WHITENED_RESIDUAL: Final = 4.0
 """Magnitude to which the whitened residual is limited. Chance exceeds it once in 3000 bins."""
 
 _MAX_LAG_S: Final = 1.0
@@ -171,17 +171,20 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
     bin_power = residual.real**2 + residual.imag**2
     cumulative_power = np.concatenate([[0.0], np.cumsum(bin_power)])
     largest_deviate, loudest_hz, loudest_ratio, is_loud = -math.inf, (0.0, 0.0), 1.0, False
-    for window_bins, loud_ratio in _LOUD_POWER_RATIOS.items():
+    for window_bins, loud_ratio in _MIN_LOUD_POWER_RATIO_BY_BINS.items():
         if window_bins >= bin_count:
             continue
         window_power = cumulative_power[window_bins:] - cumulative_power[:-window_bins]
-        i = int(np.argmax(window_power))
-        window_deviate = chi_square_deviate(float(window_power[i]), 2 * window_bins)
+        loudest_start = int(np.argmax(window_power))
+        window_deviate = chi_square_deviate(float(window_power[loudest_start]), 2 * window_bins)
         if window_deviate > largest_deviate:
             largest_deviate = window_deviate
-            loudest_hz = (float(frequency_hz[i]), float(frequency_hz[i + window_bins - 1]))
-            loudest_ratio = float(window_power[i]) / (2 * window_bins)
-        is_loud |= float(window_power[i]) / (2 * window_bins) > loud_ratio
+            loudest_hz = (
+                float(frequency_hz[loudest_start]),
+                float(frequency_hz[loudest_start + window_bins - 1]),
+            )
+            loudest_ratio = float(window_power[loudest_start]) / (2 * window_bins)
+        is_loud |= float(window_power[loudest_start]) / (2 * window_bins) > loud_ratio
     return Whiteness(
         distance=largest_distance,
         band=KOLMOGOROV_95 / math.sqrt(bin_count),
@@ -215,7 +218,7 @@ def input_relation(
     )
     normalized_angle = angle_transform / np.sqrt(np.maximum(mean_power, np.finfo(float).tiny))
     # The limit keeps a hum, which is no linear dynamics, from dominating.
-    limited_residual = residual / np.maximum(np.abs(residual) / _RESIDUAL_LIMIT, 1.0)
+    limited_residual = residual / np.maximum(np.abs(residual) / _MAX_WHITENED_RESIDUAL, 1.0)
     cross_spectrum = limited_residual * normalized_angle.conj()
     block_count = residual.size // _COHERENT_BINS
     first_bins = np.arange(0, block_count * _COHERENT_BINS, _COHERENT_BINS)
@@ -247,15 +250,15 @@ def input_relation(
     spacing_hz = float(frequency_hz[1] - frequency_hz[0])
     padded_length = 4 * residual.size
     lag_transform = np.fft.ifft(cross_spectrum, padded_length)
-    at_s = np.fft.fftfreq(padded_length, spacing_hz)  # bins are spaced as the lags' inverse
-    first_bin_carrier = np.exp(2j * np.pi * frequency_hz[0] * at_s)
+    lags_s = np.fft.fftfreq(padded_length, spacing_hz)  # bins are spaced as the lags' inverse
+    first_bin_carrier = np.exp(2j * np.pi * frequency_hz[0] * lags_s)
     correlation = (
         np.abs((lag_transform * first_bin_carrier).real)
         * padded_length
         / np.linalg.norm(normalized_angle)
     )
-    correlation[np.abs(at_s) > _MAX_LAG_S] = 0.0
-    at = int(np.argmax(correlation))
+    correlation[np.abs(lags_s) > _MAX_LAG_S] = 0.0
+    largest_index = int(np.argmax(correlation))
     lag_count = int(np.count_nonzero(correlation))
     return InputRelation(
         coherence=float(coherence[least_likely_index]),
@@ -264,12 +267,12 @@ def input_relation(
         ),
         local=is_locally_related,
         deviate=summed_deviate,
-        correlation=float(correlation[at]),
-        lag_s=float(at_s[at]),
+        correlation=float(correlation[largest_index]),
+        lag_s=float(lags_s[largest_index]),
         related=bool(
             is_locally_related
             or summed_deviate > SIGNIFICANT_STD
-            or correlation[at] ** 2 / 2 > largest_deviate_limit(lag_count)
+            or correlation[largest_index] ** 2 / 2 > largest_deviate_limit(lag_count)
         ),
     )
 
@@ -285,7 +288,7 @@ _BLOCK_DURATION_S: Final = 1.0
 _MIN_DRIVE_HZ: Final = 2.0
 """Drive frequency below which a block does not resolve a frequency and its double."""
 
-_STEADINESS_LIMIT: Final = 0.3
+_MAX_UNSTEADINESS: Final = 0.3
 """Largest deviation of the phase from a smooth curve in rad, and smallest amplitude relative to the
 median, of a usable block."""
 
@@ -347,8 +350,8 @@ def harmonics(
         phase_rad - np.polynomial.polynomial.polyval(block_time, phase_coefficients)
     ).mean(axis=1)
     is_steady_block = (
-        (phase_deviation < _STEADINESS_LIMIT)
-        & (block_amplitude > _STEADINESS_LIMIT * np.median(block_amplitude))
+        (phase_deviation < _MAX_UNSTEADINESS)
+        & (block_amplitude > _MAX_UNSTEADINESS * np.median(block_amplitude))
         & (drive_hz > _MIN_DRIVE_HZ)
     )
     hann_window = np.hanning(block_length)

@@ -206,13 +206,13 @@ def density_check(
     parameter_indices = [fit.determined.index(name) for name in _COMPENSATING_PARAMETERS]
     statistical_variance = float(fit.covariance[np.ix_(parameter_indices, parameter_indices)].sum())
     found_kg_per_m = fit.parameters[_DENSITY_OVER_STIFFNESS] * fit.parameters[_BENDING_STIFFNESS]
-    relative_std = math.sqrt(
+    relative_density_std = math.sqrt(
         statistical_variance
         + _relative_scale_uncertainty(_DENSITY_EXPONENTS, scale_uncertainty) ** 2
     )
     return DensityCheck(
         found_kg_per_m,
-        found_kg_per_m * relative_std,
+        found_kg_per_m * relative_density_std,
         stated_kg_per_m,
         stated_kg_per_m * scale_uncertainty["density"],
     )

@@ -39,7 +39,7 @@ _PLAUSIBLE_P_VALUE: Final = 0.3
 """p-value from which the stated tolerance suffices. The limit is high, since the damping orders of
 the fit compensate a part of the deviations of a beam that exceeds the tolerance."""
 
-_PLAUSIBLE_P_VALUE_WIDER: Final = 0.1
+_PLAUSIBLE_P_VALUE_WITH_WIDER_TOLERANCE: Final = 0.1
 """p-value from which the wider tolerance suffices."""
 
 _WIDER_FREQUENCY_TOLERANCE: Final = 3e-3
@@ -54,7 +54,7 @@ _LOSS_TOLERANCE: Final = 0.01
 _MIN_VISIBLE_MODES: Final = 2
 """Smallest number of visible modes for an estimate with tolerance."""
 
-_AGREEING_DEVIANCE: Final = 1.0
+_MAX_AGREEING_DEVIANCE: Final = 1.0
 """Increase of chi-square up to which the losses agree with an order of 1, for frequencies within
 the stated tolerance: one standard deviation."""
 
@@ -70,7 +70,7 @@ _INTERVAL_END_TOLERANCE: Final = 0.05
 _MAX_DISTANCE_GROWTH: Final = 3.0
 """Largest factor by which one profile step increases the distance from the estimate."""
 
-_MAX_EXPONENT: Final = 300.0
+_MAX_INTERVAL_EXPONENT: Final = 300.0
 """Largest exponent of an interval end, which keeps `exp` finite."""
 
 
@@ -128,7 +128,7 @@ class TolerantEstimate:
         deviate by more than the stated tolerance, the losses alone must exclude 1.
         """
         has_stated_tolerance = self.uniformity <= self.stated_uniformity
-        agreeing_deviance = _AGREEING_DEVIANCE if has_stated_tolerance else NORMAL_95**2
+        agreeing_deviance = _MAX_AGREEING_DEVIANCE if has_stated_tolerance else NORMAL_95**2
         return any(
             not self.interval[order_name][0] <= 1 <= self.interval[order_name][1]
             and deviance < agreeing_deviance
@@ -148,8 +148,8 @@ class TolerantEstimate:
 
 
 def tolerant_estimate(
-    fit: ModalEstimate,
-    nominal: Plant,
+    modal_estimate: ModalEstimate,
+    nominal_plant: Plant,
     uniformity: float,
     tilt_deg: float | None = None,
     *,
@@ -163,9 +163,9 @@ def tolerant_estimate(
 
     Parameters
     ----------
-    fit : ModalEstimate
+    modal_estimate : ModalEstimate
         Fitted modal model with the covariance of its constants.
-    nominal : Plant
+    nominal_plant : Plant
         Rig and specimen as the file states them.
     uniformity : float
         Stated relative standard deviation of each frequency.
@@ -180,13 +180,13 @@ def tolerant_estimate(
     TolerantEstimate or None
         None if fewer than two modes are visible.
     """
-    mode_numbers = fit.visible_mode_numbers
+    mode_numbers = modal_estimate.visible_mode_numbers
     if len(mode_numbers) < _MIN_VISIBLE_MODES:
         return None
     wider_frequency_tolerance = max(_WIDER_FREQUENCY_TOLERANCE, uniformity)
     tolerance_attempts: tuple[tuple[EstimateBasis, float, float], ...] = (
         ("geometry", uniformity, _PLAUSIBLE_P_VALUE),
-        ("geometry", wider_frequency_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
+        ("geometry", wider_frequency_tolerance, _PLAUSIBLE_P_VALUE_WITH_WIDER_TOLERANCE),
         ("losses", _LOOSE_FREQUENCY_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
     )
     for estimate_basis, frequency_tolerance, min_p_value in tolerance_attempts:
@@ -198,7 +198,12 @@ def tolerant_estimate(
             else INTEGRAL_TOLERANCE_RATIO * frequency_tolerance
         )
         problem = UniformBeamProblem(
-            fit, mode_numbers, nominal, frequency_tolerance, tilt_deg, loss_tolerance
+            modal_estimate,
+            mode_numbers,
+            nominal_plant,
+            frequency_tolerance,
+            tilt_deg,
+            loss_tolerance,
         )
         minima = problem.minima()
         # With the loose tolerance frequencies and residues do not count as data.
@@ -225,7 +230,12 @@ def tolerant_estimate(
         return beam_estimate
     if estimate_basis == "geometry":
         problem = UniformBeamProblem(
-            fit, mode_numbers, nominal, _LOOSE_FREQUENCY_TOLERANCE, tilt_deg, loss_tolerance
+            modal_estimate,
+            mode_numbers,
+            nominal_plant,
+            _LOOSE_FREQUENCY_TOLERANCE,
+            tilt_deg,
+            loss_tolerance,
         )
         minima = problem.minima()
     best_minimum = minima[0]
@@ -298,7 +308,10 @@ def _estimate_at_minimum(
                 math.exp(parameter_value),
                 math.exp(parameter_value) * parameter_std,
             )
-            lower_end, upper_end = math.exp(lower_end), math.exp(min(upper_end, _MAX_EXPONENT))
+            lower_end, upper_end = (
+                math.exp(lower_end),
+                math.exp(min(upper_end, _MAX_INTERVAL_EXPONENT)),
+            )
         intervals[parameter_name], std[parameter_name] = (lower_end, upper_end), parameter_std
     return TolerantEstimate(
         basis=estimate_basis,

@@ -58,7 +58,7 @@ _DELAY_UNIT_S: Final = 0.01
 _DELAY_UNKNOWN_LIMIT: Final = 1.0
 """Largest magnitude of the delay unknown, in units of `_DELAY_UNIT_S`."""
 
-_SHAPE_UPDATES: Final = 4
+_MODE_SHAPE_UPDATE_COUNT: Final = 4
 """Number of times that the mode shapes of a loaded or tilted beam are recomputed for the fitted
 beam."""
 
@@ -75,7 +75,7 @@ INTEGRAL_TOLERANCE_RATIO: Final = 3
 """Relative tolerance of residues, and of damping ratios if the beam is not uniform, over that of
 the frequencies. They are integrals over a mode's shape, which vary more than its frequency."""
 
-_IDLE_CURVATURE: Final = 1e-4
+_MAX_CURVATURE_OF_IDLE_UNKNOWN: Final = 1e-4
 """Second derivative of chi-square by an unknown below which the unknown has no effect."""
 
 
@@ -89,11 +89,11 @@ class UniformBeamProblem:
 
     Parameters
     ----------
-    fit : ModalEstimate
+    modal_estimate : ModalEstimate
         Fitted modal model with the covariance of its constants.
-    modes : sequence of int
+    mode_numbers : sequence of int
         Numbers of the visible modes.
-    nominal : Plant
+    nominal_plant : Plant
         Rig and specimen as the file states them, with the tip mass if the file states one.
     uniformity : float
         Relative standard deviation of each frequency, in addition to the noise.
@@ -106,34 +106,34 @@ class UniformBeamProblem:
 
     def __init__(
         self,
-        fit: ModalEstimate,
-        modes: Sequence[int],
-        nominal: Plant,
+        modal_estimate: ModalEstimate,
+        mode_numbers: Sequence[int],
+        nominal_plant: Plant,
         uniformity: float = 0.0,
         tilt_deg: float | None = None,
         loss_tolerance: float = 0.0,
     ) -> None:
-        constant_rows = fit.constant_indices(modes)
-        mode_count = len(modes)
-        self.modes = tuple(modes)
-        self.nominal = nominal
+        constant_indices = modal_estimate.constant_indices(mode_numbers)
+        mode_count = len(mode_numbers)
+        self.modes = tuple(mode_numbers)
+        self.nominal = nominal_plant
         self.uniformity = uniformity
-        self.measured = fit.mode_constants[constant_rows]
+        self.measured = modal_estimate.mode_constants[constant_indices]
         tolerance_std = np.zeros((mode_count, len(MODE_CONSTANT_NAMES)))
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_frequency")] = uniformity
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_damping_ratio")] = loss_tolerance
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_residue")] = (
             INTEGRAL_TOLERANCE_RATIO * uniformity
         )
-        self.covariance = fit.covariance[np.ix_(constant_rows, constant_rows)] + np.diag(
-            tolerance_std.ravel() ** 2
-        )
+        self.covariance = modal_estimate.covariance[
+            np.ix_(constant_indices, constant_indices)
+        ] + np.diag(tolerance_std.ravel() ** 2)
         self.constant_count = mode_count * len(MODE_CONSTANT_NAMES)
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
-        length_m = nominal.beam.length_m
-        z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
-        self.stated_alteration = BeamDeviations.from_nominal_plant(nominal, tilt_deg)
-        self.terms = galerkin_mode_terms(self.stated_alteration, nominal.beam, self.modes)
+        length_m = nominal_plant.beam.length_m
+        eigenvalues = clamped_free_eigenvalues(max(mode_numbers))[np.array(mode_numbers) - 1]
+        self.stated_alteration = BeamDeviations.from_nominal_plant(nominal_plant, tilt_deg)
+        self.terms = galerkin_mode_terms(self.stated_alteration, nominal_plant.beam, self.modes)
         constants_by_mode = self.measured.reshape(-1, len(MODE_CONSTANT_NAMES))
         self._omega_rad_s = 2 * np.pi * np.exp(constants_by_mode[:, 0])
         self._damping_ratios = np.exp(constants_by_mode[:, 1])
@@ -141,7 +141,9 @@ class UniformBeamProblem:
         # The search starts at the mean of all modes.
         modal_masses = self.terms.mass + self.terms.point_mass
         self._ln_density_over_stiffness = float(
-            np.mean(np.log((z / length_m) ** 4 / modal_masses) - 2 * np.log(self._omega_rad_s))
+            np.mean(
+                np.log((eigenvalues / length_m) ** 4 / modal_masses) - 2 * np.log(self._omega_rad_s)
+            )
         )
         ln_stiffness = constants_by_mode[:, 2] - np.log(self._omega_rad_s) + np.log(length_m / 2)
         self._ln_stiffness = float(np.mean(ln_stiffness))
@@ -187,17 +189,17 @@ class UniformBeamProblem:
         """Return the Galerkin coefficients of the uniform beam alone."""
         return galerkin_mode_terms(BeamDeviations(), self.nominal.beam, self.modes)
 
-    def parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def parameters(self, vector_of_unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert unknowns, shape (..., 7), to the values of `PARAMETERS`.
 
         Those in `LOGARITHMIC_PARAMETERS` are returned as natural logarithms.
         """
-        return x @ self.transform.T + self._offset
+        return vector_of_unknowns @ self.transform.T + self._offset
 
-    def plant(self, x: NDArray[np.float64]) -> Plant:
+    def plant(self, vector_of_unknowns: NDArray[np.float64]) -> Plant:
         """Return the rig with the uniform beam and damping for a vector of unknowns, shape (7,)."""
         ln_zeta, alpha, ln_gamma, lambda_, ln_ratio, ln_stiffness, delay_s = self.parameters(
-            x
+            vector_of_unknowns
         ).tolist()
         stiffness_n_m2 = math.exp(ln_stiffness)
         return replace(
@@ -213,33 +215,35 @@ class UniformBeamProblem:
             delay_s=delay_s,
         )
 
-    def constants(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def constants(self, vector_of_unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predict the modal constants of a uniform beam with n modes, shape (4 n,).
 
         The four constants of a mode are `MODE_CONSTANT_NAMES`. A mode without pole gives NaN.
 
         Parameters
         ----------
-        x : ndarray of float, shape (7,)
+        vector_of_unknowns : ndarray of float, shape (7,)
             Vector of unknowns.
         """
-        return self._vibration(x, self.terms).constants()
+        return self._vibration(vector_of_unknowns, self.terms).constants()
 
-    def _vibration(self, x: NDArray[np.float64], terms: ModeTerms) -> BeamVibration:
+    def _vibration(
+        self, vector_of_unknowns: NDArray[np.float64], mode_terms: ModeTerms
+    ) -> BeamVibration:
         """Return poles and residues of the beam with the given Galerkin coefficients."""
         return BeamVibration(
-            self.parameters(x).tolist(),
-            terms,
+            self.parameters(vector_of_unknowns).tolist(),
+            mode_terms,
             self.nominal.beam.length_m,
-            self.nominal.filter_denominators + terms.deviations.torque_lag_denominators,
+            self.nominal.filter_denominators + mode_terms.deviations.torque_lag_denominators,
             self._measured_poles,
         )
 
     def residual_and_slopes(
         self,
-        x: NDArray[np.float64],
+        vector_of_unknowns: NDArray[np.float64],
         whitener: NDArray[np.float64],
-        terms: ModeTerms | None = None,
+        mode_terms: ModeTerms | None = None,
     ) -> tuple[NDArray[np.float64], Callable[[], NDArray[np.float64]]]:
         """Return predicted minus measured modal constants, whitened, and a function for slopes.
 
@@ -248,11 +252,11 @@ class UniformBeamProblem:
 
         Parameters
         ----------
-        x : ndarray of float, shape (7,)
+        vector_of_unknowns : ndarray of float, shape (7,)
             Vector of unknowns.
         whitener : ndarray of float, shape (4 n, 4 n)
             Matrix by which the differences are multiplied.
-        terms : ModeTerms, optional
+        mode_terms : ModeTerms, optional
             Galerkin coefficients of another beam than the one the file states.
 
         Returns
@@ -262,12 +266,14 @@ class UniformBeamProblem:
         slopes : callable
             Function that returns the derivatives of the residual by the unknowns, shape (7, 4 n).
         """
-        vibration = self._vibration(x, self.terms if terms is None else terms)
+        vibration = self._vibration(
+            vector_of_unknowns, self.terms if mode_terms is None else mode_terms
+        )
         differences = vibration.constants() - self.measured
         if np.isnan(differences).any():
             return (
                 np.full(self.constant_count, _RESIDUAL_WITHOUT_POLE),
-                lambda: np.zeros((x.size, self.constant_count)),
+                lambda: np.zeros((vector_of_unknowns.size, self.constant_count)),
             )
         phase_differences = differences[
             MODE_CONSTANT_NAMES.index("residue_phase_rad") :: len(MODE_CONSTANT_NAMES)
@@ -278,9 +284,9 @@ class UniformBeamProblem:
             lambda: (whitener @ vibration.constant_slopes() @ self.transform).T,
         )
 
-    def equations(self, x: NDArray[np.float64]) -> NormalEquations:
+    def equations(self, vector_of_unknowns: NDArray[np.float64]) -> NormalEquations:
         """Return chi-square at one vector of unknowns with its gradient and Gauss-Newton matrix."""
-        residual, slopes = self.residual_and_slopes(x, self._whitener)
+        residual, slopes = self.residual_and_slopes(vector_of_unknowns, self._whitener)
         jacobian = slopes()
         return NormalEquations(
             float(residual @ residual), jacobian @ residual, jacobian @ jacobian.T
@@ -331,14 +337,16 @@ class UniformBeamProblem:
             )
         return start_vectors
 
-    def minimize(self, x: NDArray[np.float64]) -> Minimum:
+    def minimize(self, vector_of_unknowns: NDArray[np.float64]) -> Minimum:
         """Minimize chi-square from one start vector, with all unknowns free."""
-        return _minimize_within_bounds(self.equations, x, self.lower, self.upper)
+        return _minimize_within_bounds(self.equations, vector_of_unknowns, self.lower, self.upper)
 
     def minima(self) -> list[Minimum]:
         """Minimize chi-square from all start vectors. Return the minima, the lowest first."""
         minima = self._minimize_from(self.starts())
-        for _ in range(_SHAPE_UPDATES if self.stated_alteration != BeamDeviations() else 0):
+        for _ in range(
+            _MODE_SHAPE_UPDATE_COUNT if self.stated_alteration != BeamDeviations() else 0
+        ):
             self.terms = galerkin_mode_terms(
                 self.stated_alteration, self.plant(minima[0].x).beam, self.modes
             )
@@ -347,9 +355,14 @@ class UniformBeamProblem:
 
     def _minimize_from(self, start_vectors: Sequence[NDArray[np.float64]]) -> list[Minimum]:
         """Minimize chi-square from each start vector. Return the minima, the lowest first."""
-        return sorted((self.minimize(x) for x in start_vectors), key=lambda minimum: minimum.cost)
+        return sorted(
+            (self.minimize(vector_of_unknowns) for vector_of_unknowns in start_vectors),
+            key=lambda minimum: minimum.cost,
+        )
 
-    def minimize_without_damping(self, coefficient_index: int, x: NDArray[np.float64]) -> Minimum:
+    def minimize_without_damping(
+        self, coefficient_index: int, vector_of_unknowns: NDArray[np.float64]
+    ) -> Minimum:
         """Minimize chi-square with the loss of one damping fixed at its lower bound.
 
         This is a fit without internal or without external damping.
@@ -358,15 +371,15 @@ class UniformBeamProblem:
         ----------
         coefficient_index : int
             Index of the damping's coefficient in `PARAMETERS`.
-        x : ndarray of float, shape (7,)
+        vector_of_unknowns : ndarray of float, shape (7,)
             Vector of unknowns at which the descent starts.
         """
         upper_bounds = self.upper.copy()
         upper_bounds[coefficient_index] = self.lower[coefficient_index]
-        return _minimize_within_bounds(self.equations, x, self.lower, upper_bounds)
+        return _minimize_within_bounds(self.equations, vector_of_unknowns, self.lower, upper_bounds)
 
     def minimize_with_fixed(
-        self, parameter_index: int, fixed_value: float, x: NDArray[np.float64]
+        self, parameter_index: int, fixed_value: float, vector_of_unknowns: NDArray[np.float64]
     ) -> Minimum:
         """Minimize chi-square with one of `PARAMETERS` fixed, and return the minimum.
 
@@ -376,11 +389,11 @@ class UniformBeamProblem:
             Index of the fixed parameter in `PARAMETERS`.
         fixed_value : float
             Fixed value, as `parameters` returns it.
-        x : ndarray of float, shape (7,)
+        vector_of_unknowns : ndarray of float, shape (7,)
             Vector of unknowns at which the descent starts.
         """
         # The parameter replaces the unknown that contributes to it with factor 1.
-        to_transformed = np.eye(x.size)
+        to_transformed = np.eye(vector_of_unknowns.size)
         to_transformed[parameter_index] = (
             self.transform[parameter_index] / self.transform[parameter_index, parameter_index]
         )
@@ -390,9 +403,9 @@ class UniformBeamProblem:
             fixed_value - self._offset[parameter_index]
         ) / self.transform[parameter_index, parameter_index]
 
-        def equations(y: NDArray[np.float64]) -> NormalEquations:
+        def equations(transformed_unknowns: NDArray[np.float64]) -> NormalEquations:
             """Return chi-square and its derivatives by the transformed unknowns."""
-            original_equations = self.equations(from_transformed @ y)
+            original_equations = self.equations(from_transformed @ transformed_unknowns)
             return NormalEquations(
                 original_equations.cost,
                 from_transformed.T @ original_equations.gradient,
@@ -400,7 +413,7 @@ class UniformBeamProblem:
             )
 
         constrained_minimum = _minimize_within_bounds(
-            equations, to_transformed @ x, lower_bounds, upper_bounds
+            equations, to_transformed @ vector_of_unknowns, lower_bounds, upper_bounds
         )
         return replace(constrained_minimum, x=from_transformed @ constrained_minimum.x)
 
@@ -416,19 +429,21 @@ class UniformBeamProblem:
         """
         chi_square_curvature = np.diag(minimum.equations.hessian)
         is_at_bound = minimum.equations.is_held_at_bound(minimum.x, self.lower, self.upper)
-        return int(np.count_nonzero(is_at_bound | (chi_square_curvature < _IDLE_CURVATURE)))
+        return int(
+            np.count_nonzero(is_at_bound | (chi_square_curvature < _MAX_CURVATURE_OF_IDLE_UNKNOWN))
+        )
 
 
 def _minimize_within_bounds(
     equations: Callable[[NDArray[np.float64]], NormalEquations],
-    x: NDArray[np.float64],
+    vector_of_unknowns: NDArray[np.float64],
     lower_bounds: NDArray[np.float64],
     upper_bounds: NDArray[np.float64],
 ) -> Minimum:
     """Minimize a sum of squares within bounds by Gauss-Newton descent."""
     return descend(
         equations,
-        x,
+        vector_of_unknowns,
         ConstantBounds(lower_bounds, upper_bounds),
         relative_tolerance=_COST_TOLERANCE,
         max_evaluations=_MAX_EVALUATIONS,

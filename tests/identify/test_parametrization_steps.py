@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.identify import SETTINGS
-from analysis.identify.parametrization import VANISHING_LOSS, StepRule, Unknowns
+from analysis.identify.parametrization import VANISHING_LOSS_FACTOR, StepRule, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, Plant
 
@@ -112,7 +112,7 @@ def test_steps_without_a_free_order_are_straight():
 @pytest.mark.parametrize("structure", ["VI", "III"])
 def test_tiny_loss_grows_by_the_requested_step(structure):
     unknowns = Unknowns.for_structure(STRUCTURES[structure], NOMINAL, SETTINGS)
-    steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS)
+    steps = StepRule.for_unknowns(unknowns, VANISHING_LOSS_FACTOR)
     index = unknowns.names.index("zeta")
     x, step = unknowns.vector(NOMINAL), np.zeros(len(unknowns.names))
     # A loss of 1e-8 is to become 1e-5: a step of its logarithm by 999 would end at the upper bound.

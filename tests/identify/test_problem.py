@@ -5,7 +5,7 @@ from analysis.identify import SETTINGS, Comparison, Objective
 from analysis.identify._refit import Refit
 from analysis.identify._search import Descent
 from analysis.identify.noise import NoiseSpectrum
-from analysis.identify.parametrization import VANISHING_LOSS, StepRule, Unknowns
+from analysis.identify.parametrization import VANISHING_LOSS_FACTOR, StepRule, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, Plant
 
@@ -82,7 +82,7 @@ def test_torques_are_replaced_after_a_descent(sessions, monkeypatch, most, hopel
     _, found = Objective(comparison, unknowns).minimum(
         unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8])),
         np.ones(comparison.frequency_hz.size),
-        StepRule.for_unknowns(unknowns, VANISHING_LOSS),
+        StepRule.for_unknowns(unknowns, VANISHING_LOSS_FACTOR),
         relative_tolerance=1e-8,
         max_evaluations=most,
         give_up_condition=hopeless,

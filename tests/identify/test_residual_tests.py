@@ -34,7 +34,10 @@ def test_noise_is_white_within_its_band():
 def test_noise_with_estimated_spectrum_is_not_loud(draws):
     """The spectrum is estimated from the noise itself, as the modal fit does it."""
     drawn = (noise(seed) for seed in range(draws))
-    found = [whiteness(each * np.sqrt(2 / smooth_power(each, finely=True)), HZ) for each in drawn]
+    found = [
+        whiteness(each * np.sqrt(2 / smooth_power(each, has_narrow_blocks=True)), HZ)
+        for each in drawn
+    ]
     assert not any(test.loud for test in found)
 
 
