@@ -222,7 +222,9 @@ class ModalFit(ModalEstimate):
     @property
     def visible_mode_numbers(self) -> tuple[int, ...]:
         """Return the sorted numbers of the beam modes that are visible in the record."""
-        modes_with_cost_increase = zip(self.numbers, self.cost_increases_without_mode, strict=True)
+        modes_with_cost_increase = zip(
+            self.mode_numbers, self.cost_increases_without_mode, strict=True
+        )
         return tuple(
             sorted(
                 mode_number

@@ -39,8 +39,8 @@ class BeamVibration:
 
     `parameters` are the values of `analysis.identify.uniform_beam.PARAMETERS`, those in
     `LOGARITHMIC_PARAMETERS` as logarithms, and `mode_terms` the Galerkin coefficients of the modes.
-    `lag_denominators` are the lags of the torque channel as in `rigd.beam.Plant.filter_denominators`, and
-    `start_poles_rad_s` approximate poles.
+    `lag_denominators` are the lags of the torque channel as in
+    `rigd.beam.Plant.filter_denominators`, and `start_poles_rad_s` approximate poles.
     """
 
     __slots__ = ("_modes",)

@@ -92,7 +92,7 @@ class Refit:
         for fixed_name in fixed_unknowns:
             fixed_index = unknowns.names.index(fixed_name)
             step_rule.lower[fixed_index] = step_rule.upper[fixed_index] = x[fixed_index]
-        objective, minimum = Objective(comparison, unknowns, torque_spectra).minimum(
+        objective, minimum = Objective(comparison, unknowns, torque_spectra).find_minimum(
             x,
             noise.weight,
             step_rule,

@@ -139,7 +139,7 @@ def uniform_beam_test(
         p_value=p_value,
         mode_numbers=mode_numbers,
         measured_constants=measured_constants,
-        predicted_constants=problem.constants_with_covariance(best_minimum.x),
+        predicted_constants=problem.constants(best_minimum.x),
         constant_stds=std,
         problem=problem,
         best_fit_unknowns=best_minimum.x,

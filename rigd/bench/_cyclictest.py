@@ -50,7 +50,7 @@ def run_cyclictest(
         *(f"--histogram={_MAX_HISTOGRAM_DELAY_US}", f"--latency={MAX_WAKE_UP_US}"),
     ]
     try:
-        completed_process = subprocess.run_cyclictest(
+        completed_process = subprocess.run(
             command_line,
             capture_output=True,
             text=True,

@@ -246,7 +246,7 @@ def stopping_distance_rows(profile: Profile) -> Iterator[CheckRow]:
     ]
     worst_index = max(
         range(len(uncontrolled_failures)),
-        profile_key=lambda failure_index: stopping_distances[failure_index].total_distance_rad,
+        key=lambda failure_index: stopping_distances[failure_index].total_distance_rad,
     )
     for failure_index, (uncontrolled_failure, stopping_distance) in enumerate(
         zip(uncontrolled_failures, stopping_distances, strict=True)

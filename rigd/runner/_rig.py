@@ -109,7 +109,7 @@ class Rig:
     @property
     def is_simulated(self) -> bool:
         """Whether the rig is simulated; False before the first connection."""
-        return self._connection is not None and self._connection.is_simulated
+        return self._connection is not None and self._connection.simulated
 
     @property
     def angle_rad(self) -> float:
@@ -188,7 +188,7 @@ class Rig:
         self.connected = True
         self.zero_lost |= self._has_zero_to_lose
         # The angle of this connection is the zero now. Only on hardware can the next one differ.
-        self._has_zero_to_lose = not connection.is_simulated
+        self._has_zero_to_lose = not connection.simulated
 
     def run(
         self,

@@ -135,9 +135,7 @@ class SdoAccess:
         self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_DEFAULT_EDS_PATH), node_id))
         self._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
         self._node.sdo.MAX_RETRIES = _SDO_ATTEMPTS
-        port.acceptance_name(
-            None
-        )  # a sensor on the same bus may have restricted it to its own frames
+        port.accept(None)  # a sensor on the same bus may have restricted it to its own frames
         self._network = canopen.Network(port.open_bus())
         self._network.NOTIFIER_CYCLE = _RECEIVER_POLL_INTERVAL_S
         self._network.listeners = [_ErrorIgnoringListener(self._network)]
@@ -271,7 +269,7 @@ class SdoAccess:
         index, subindex = assignment.index, assignment.subindex
         variable = self._variable(index, subindex)
         variable.data_type = _DATA_TYPES[assignment.integer_type]
-        self.configure(index, subindex, assignment.value)
+        self.configure(index, subindex, assignment.object_value)
 
     def last_emergency(self) -> int:
         """Return the error code of the drive's last emergency message, or 0 if there was none."""
@@ -389,11 +387,9 @@ def _load_integer_types(
 
 def _variables_of_entry(dictionary_entry: object) -> list[ODVariable]:
     """Return the variables of a dictionary entry: the entry itself, or its sub-entries."""
-    return (
-        [dictionary_entry]
-        if isinstance(dictionary_entry, ODVariable)
-        else list(dictionary_entry.values())
-    )  # type: ignore[attr-defined]
+    if isinstance(dictionary_entry, ODVariable):
+        return [dictionary_entry]
+    return list(dictionary_entry.values())  # type: ignore[attr-defined]
 
 
 def _communication_parameter_type(index: int, subindex: int) -> str:
