@@ -1,8 +1,9 @@
 """Describe the requests of the operator's page, as an OpenAPI document, from the server's routes.
 
-Methods, paths and summaries are those of the routes of `rigd.web`, and the commands those of the
-control socket. `REQUESTS` adds what the code of a route does not declare; a route without an entry
-there, or an entry without a route, ends the build.
+Methods and paths are those of the routes of `rigd.web`, and the commands those of the control
+socket. A summary is the first sentence of the docstring, unless `REQUESTS` replaces it. `REQUESTS`
+adds what the code of a route does not declare; a route without an entry there, or an entry without
+a route, ends the build.
 """
 
 import inspect
@@ -58,15 +59,26 @@ def an_object(**members: Document) -> Document:
 
 QUEUED = {202: (JSON, an_object(ok={"const": True}, job={"type": "integer"}))}
 """Reply to a request for a job, with the number that messages of the type `job` state."""
+OPTIONAL_TOKEN = (
+    "yes, except for `stop`, and for `predict` unless `parameters` has a `path` (a file)"
+)
 SESSION_NAMES = {**listed("ids", TEXT)["ids"], "minItems": 2}
 REQUESTS: dict[str, Document] = {
-    "GET /": {"replies": {200: (HTML, TEXT)}},
-    "GET /static/{name}": {"replies": {200: (BYTES, TEXT)}, "errors": (404,)},
-    "GET /favicon.ico": {"replies": {200: ("image/svg+xml", TEXT)}},
+    "GET /": {"summary": "Send the page.", "replies": {200: (HTML, TEXT)}},
+    "GET /static/{name}": {
+        "summary": "Send another file of the page; `{name}` is the name of the file.",
+        "replies": {200: (BYTES, TEXT)},
+        "errors": (404,),
+    },
+    "GET /favicon.ico": {
+        "summary": "Send the icon of the page.",
+        "replies": {200: ("image/svg+xml", TEXT)},
+    },
     "GET /api/live": {"replies": {101: None}},
     "POST /api/command": {
         "body": {"$ref": f"{SCHEMAS}Command"},
         "token": "optional",
+        "description": "Without the token only stop, and predict unless it has parameters.path.",
         "replies": {200: (JSON, an_object(reply=TEXT, ok={"const": True}))},
         "errors": (400, 403, 409, 503),
     },
@@ -92,15 +104,32 @@ REQUESTS: dict[str, Document] = {
         "replies": {200: (JSON, {"type": "object"})},
         "errors": (404,),
     },
-    "GET /api/sessions/{id}/report/": {"replies": {200: (HTML, TEXT)}, "errors": (404,)},
-    "GET /api/sessions/{id}/report/{name}": {"replies": {200: (BYTES, TEXT)}, "errors": (404,)},
+    "GET /api/sessions/{id}/report/": {
+        "summary": "Send the page of the last analysis report of a session.",
+        "replies": {200: (HTML, TEXT)},
+        "errors": (404,),
+    },
+    "GET /api/sessions/{id}/report/{name}": {
+        "summary": "Send another file of this report; `{name}` is the name of the file.",
+        "replies": {200: (BYTES, TEXT)},
+        "errors": (404,),
+    },
     "POST /api/sessions/{id}/report": {
         "token": "required",
         "replies": QUEUED,
         "errors": (403, 404, 409),
     },
-    "GET /api/campaign/{name}/": {"replies": {200: (HTML, TEXT)}, "errors": (404,)},
-    "GET /api/campaign/{name}/{file}": {"replies": {200: (BYTES, TEXT)}, "errors": (404,)},
+    "GET /api/campaign/{name}/": {
+        "summary": "Send the page of the analysis report of a campaign; `{name}` is the name of "
+        "the report's folder, such as `campaign.report`.",
+        "replies": {200: (HTML, TEXT)},
+        "errors": (404,),
+    },
+    "GET /api/campaign/{name}/{file}": {
+        "summary": "Send another file of this report; `{file}` is the name of the file.",
+        "replies": {200: (BYTES, TEXT)},
+        "errors": (404,),
+    },
     "POST /api/campaign": {
         "body": an_object(ids={**SESSION_NAMES, "maxItems": _library._MAX_CAMPAIGN_SESSIONS}),
         "token": "required",
@@ -125,7 +154,7 @@ REQUESTS: dict[str, Document] = {
         "errors": (400, 404),
     },
 }
-"""Parameters, bodies and replies of each method and path."""
+"""Parameters, bodies and replies of each method and path, with a summary if routes share one."""
 
 
 def page_document() -> Document:
@@ -187,7 +216,10 @@ def operation(path: str, method: str, summary: str) -> Document:
     refusal = {JSON: {"schema": {"$ref": f"{SCHEMAS}Refusal"}}}
     for status in request.get("errors", ()):
         replies[str(status)] = {"description": ERRORS[status], "content": refusal}
+    summary = request.get("summary", summary)
     described: Document = {"summary": summary, "parameters": parameters, "responses": replies}
+    if "description" in request:
+        described["description"] = request["description"]
     if "body" in request:
         described["requestBody"] = {
             "required": True,
@@ -195,7 +227,7 @@ def operation(path: str, method: str, summary: str) -> Document:
         }
     if "token" in request:
         described["security"] = [{"token": []}]
-        if request["token"] == "optional":  # stop and predict need none
+        if request["token"] == "optional":  # stop and most predict need none
             described["security"].append({})
     return described
 
@@ -223,7 +255,7 @@ def page_rows(document: Document) -> list[tuple[str, ...]]:
             queries = [each for each in described["parameters"] if each["in"] == "query"]
             names = ", ".join(f"`{each['name']}`" for each in queries)
             text = f"{described['summary']} Query: {names}." if names else described["summary"]
-            token = {0: "", 1: "yes", 2: "but for `stop` and `predict`"}
+            token = {0: "", 1: "yes", 2: OPTIONAL_TOKEN}
             rows.append(
                 (f"`{method.upper()} {path}`", text, token[len(described.get("security", ()))])
             )
