@@ -78,7 +78,7 @@ REQUESTS: dict[str, Document] = {
     "POST /api/command": {
         "body": {"$ref": f"{SCHEMAS}Command"},
         "token": "optional",
-        "description": "Without the token only stop, and predict unless it has parameters.path.",
+        "description": "No token: only stop, and predict if parameters has no path.",
         "replies": {200: (JSON, an_object(reply=TEXT, ok={"const": True}))},
         "errors": (400, 403, 409, 503),
     },
