@@ -362,9 +362,8 @@ def _coupling_contradiction(estimate: ProbeEstimate, *, with_motor: bool) -> str
         if not with_motor:
             return ""  # no antenna: the shaft moves no farther than the encoder shows
         return (
-            f"the coupling torque is {coupling_ratio:.2f} times that of the profile's beam "
-            "at the measured "
-            "angle. Check that the antenna is mounted and the sensor works, and "
+            f"the coupling torque is {coupling_ratio:.2f} times that of the profile's beam at the "
+            "measured angle. Check that the antenna is mounted and the sensor works, and "
             "encoder.resolution_rad."
         )
     if not with_motor and 0.0 < coupling_ratio < 1.0:
@@ -373,7 +372,8 @@ def _coupling_contradiction(estimate: ProbeEstimate, *, with_motor: bool) -> str
     if coupling_ratio < 0.0:
         return (
             f"the coupling torque is {ratio_text} times that of the profile's beam at the measured "
-            "angle: it has the wrong sign (sensor.projection, mounting of the sensor)."
+            "angle. Its sign is wrong (sensor.projection, mounting of the sensor), or those of "
+            "encoder and motor torque both are (cia402.direction)."
         )
     return (
         f"the coupling torque is {ratio_text} times that of the profile's beam at the "

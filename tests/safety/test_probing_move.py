@@ -39,7 +39,7 @@ def profile():
         further(Mismatch(profile={INERTIA: 5.0}), 0.03, "motor.inertia_kg_m2", id="inertia 0.2"),
         pytest.param(Mismatch(encoder_sign=-1), 0.03, "counts against the torque", id="encoder"),
         further(Mismatch(torque_sign=-1), 0.03, "counts against the torque", id="torque"),
-        pytest.param(Mismatch(sensor_sign=-1), 0.03, "wrong sign (sensor.projection", id="sensor"),
+        pytest.param(Mismatch(sensor_sign=-1), 0.03, "sign is wrong (sensor", id="sensor"),
         pytest.param(Mismatch(frozen_from=0), 0.02, "encoder stands still", id="frozen"),
         further(Mismatch(frozen_from=1650), 0.02, "encoder stands still", id="frozen while moving"),
     ],

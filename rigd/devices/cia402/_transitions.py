@@ -47,7 +47,7 @@ def operation_left_error(drive_name: str, statusword: int) -> DeviceError:
         # The usual cause is a lost motor supply; a bus command would leave the supply on.
         is_supplied = bool(statusword & VOLTAGE_ENABLED_BIT)
         supply_hint = (
-            ", and its bit 4 says that the supply is there, which indicates such a command"
+            ", and its bit 4 says that the supply is there, so that such a command is possible"
         )
         sto_error = wired_stop_dropped(
             drive_name,
