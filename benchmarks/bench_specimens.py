@@ -98,11 +98,11 @@ def line(case: Case, found: CampaignResult) -> str:
 
 def worst_error(case: Case, found: CampaignResult) -> float:
     """Return the largest error of the pooled parameters, in their standard deviations."""
-    headline, truth = found.headline, case.records[0].truth.parameters
-    assert headline is not None
+    estimate, truth = found.freest, case.records[0].truth.parameters
+    assert estimate is not None
     return max(
         abs(each.value - truth[each.name]) / each.std
-        for each in headline.parameters
+        for each in estimate.parameters
         if each.name in truth and each.std
     )
 

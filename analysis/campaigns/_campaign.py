@@ -110,8 +110,11 @@ class CampaignResult:
     failed_predictions: tuple[FailedPrediction, ...]
 
     @property
-    def headline(self) -> PooledEstimate | None:
-        """Pooled estimate whose parameters are reported (`freest_estimate`), or None."""
+    def freest(self) -> PooledEstimate | None:
+        """Pooled estimate of an exactly uniform beam with the freest structure, or None.
+
+        It has no flags. `campaign_estimates` has the numbers to report.
+        """
         return freest_estimate(self.pooled)
 
     @property
@@ -119,7 +122,7 @@ class CampaignResult:
         """Modes pooled over all sessions, of the modal model or of an exactly uniform beam."""
         if self.modal is not None and self.modal.replaces_beam_modes:
             return self.modal.modes
-        return self.headline.modes if self.headline else ()
+        return self.freest.modes if self.freest else ()
 
     @property
     def validity(self) -> Validity:

@@ -78,7 +78,7 @@ def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
     Estimates or None
         The estimates; None without whole-record fits.
     """
-    pooled_estimate, verdict, modal_model = campaign.headline, campaign.verdict, campaign.modal
+    pooled_estimate, verdict, modal_model = campaign.freest, campaign.verdict, campaign.modal
     if pooled_estimate is None or verdict is None:
         return None
     pooled_orders = (verdict.alpha, verdict.lambda_)

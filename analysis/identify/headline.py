@@ -206,8 +206,17 @@ class Estimates:
                     each,
                     frequency_hz=each.frequency_hz.with_flag(flag),
                     damping_ratio=each.damping_ratio.with_flag(flag),
+                    participation=each.participation and each.participation.with_flag(flag),
                 )
                 for each in self.modes
+            ),
+            simpler=self.simpler
+            and replace(
+                self.simpler,
+                parameters={
+                    parameter_name: each.with_flag(flag)
+                    for parameter_name, each in self.simpler.parameters.items()
+                },
             ),
         )
 

@@ -120,7 +120,7 @@ def pooled_parameters_figure(campaign: CampaignResult) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    headline_estimate = campaign.headline
+    headline_estimate = campaign.freest
     assert headline_estimate is not None
     unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else ()
     unreported_names = unreported_parameters(

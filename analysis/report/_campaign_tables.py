@@ -49,7 +49,7 @@ def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Return the tables that the terminal shows by default: pooled modes and parameters."""
-    return headline_tables(campaign) if campaign.headline else ()
+    return headline_tables(campaign) if campaign.freest else ()
 
 
 def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
@@ -285,7 +285,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         for group_number, group_files in enumerate(session_groups, 1)
         for file_name in group_files
     }
-    structure_name = campaign.headline.name if campaign.headline else None
+    structure_name = campaign.freest.name if campaign.freest else None
     trials_by_path = {
         prediction.path: prediction
         for prediction in campaign.validation

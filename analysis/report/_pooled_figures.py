@@ -58,7 +58,7 @@ class _PooledFit:
     @classmethod
     def from_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
         """Return the pooled estimate whose parameters a campaign reports; None if there is none."""
-        modal_result, pooled_estimate = campaign.modal, campaign.headline
+        modal_result, pooled_estimate = campaign.modal, campaign.freest
         tolerant_estimate = modal_result.tolerant if modal_result else None
         if tolerant_estimate is None:
             return None if pooled_estimate is None else cls.from_estimate(pooled_estimate)
@@ -104,7 +104,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    pooled_estimate = campaign.headline
+    pooled_estimate = campaign.freest
     assert pooled_estimate is not None
     pooled_modes, session_count = campaign.modes, _session_count_of_modes(campaign, pooled_estimate)
     width_in, height_in = 11.0, 6.6
@@ -264,7 +264,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    pooled_estimate = campaign.headline
+    pooled_estimate = campaign.freest
     assert pooled_estimate is not None
     peaks_hz = [pooled_mode.frequency_hz for pooled_mode in campaign.modes]
     first_hz, last_hz = _response_band_hz(campaign, peaks_hz)

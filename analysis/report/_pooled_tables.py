@@ -106,9 +106,7 @@ def leading_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
     The list has one element if both are the same, and none without a pooled estimate.
     """
     estimates_by_name = {
-        estimate.name: estimate
-        for estimate in (campaign.headline, *campaign.pooled[:1])
-        if estimate
+        estimate.name: estimate for estimate in (campaign.freest, *campaign.pooled[:1]) if estimate
     }
     return list(estimates_by_name.values())
 
@@ -141,7 +139,7 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
     the table, followed by the structures that are not pooled, without values.
     """
     unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else frozenset[str]()
-    homogeneity, headline = campaign.homogeneity, campaign.headline
+    homogeneity, headline = campaign.homogeneity, campaign.freest
     table_columns = (
         Column("parameter", "parameter", TEXT_FORMAT),
         Column("pooled", "value"), Column("std", "std", std_of_previous=True),
@@ -257,7 +255,7 @@ def _pooled_row(
     return {
         "type": pooled_estimate.structure,
         "name": pooled_estimate.name,
-        "headline": pooled_estimate is campaign.headline,
+        "headline": pooled_estimate is campaign.freest,
         "sessions": pooled_estimate.sessions,
         "bic": pooled_estimate.bic,
         "misfit": pooled_estimate.misfit,

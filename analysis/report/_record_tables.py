@@ -442,10 +442,13 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
             (
                 Cell(parameter_name, parameter_definition.symbol),
                 _unit_cell(parameter_definition.display_unit),
-                *estimate_cells(
-                    (simpler_value.value, *_interval_ends(simpler_value)),
-                    simpler_value.std,
-                    display_factor,
+                *flagged_cells(
+                    estimate_cells(
+                        (simpler_value.value, *_interval_ends(simpler_value)),
+                        simpler_value.std,
+                        display_factor,
+                    ),
+                    simpler_value.flag,
                 ),
                 *(
                     [number_cell(None)] * 3
@@ -459,7 +462,7 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
                         free_estimate.flag,
                     )
                 ),
-                (free_estimate.flag or "") if free_estimate is not None else "",
+                simpler_value.flag or (free_estimate.flag if free_estimate else None) or "",
             )
         )
     return Table.from_rows(

@@ -90,7 +90,7 @@ def campaign_tables(
             text_parts += [Text(f"  {advice_text}") for advice_text in campaign.verdict.experiments]
         text_parts.append("")
     text_parts += with_empty_lines(shown_tables(campaign) if verbose else main_tables(campaign))
-    if verbose or with_paper_values or campaign.headline is None:
+    if verbose or with_paper_values or campaign.freest is None:
         text_parts += with_empty_lines(paper_tables(campaign, with_paper_values=with_paper_values))
     text_parts += warning_lines(_session_warnings(campaign))
     return Group(*text_parts)
@@ -319,14 +319,14 @@ def _illustrations(campaign: CampaignResult) -> Iterator[Illustration]:
     from analysis.report._pooled_figures import damping_figure, response_figure
     from analysis.report._style import Illustration
 
-    if campaign.headline is not None and campaign.modes:
+    if campaign.freest is not None and campaign.modes:
         yield Illustration(
             "damping",
             partial(damping_figure, campaign),
             "Damping ratios of all sessions' modes against frequency, and the pooled ones with "
             "their 95 % intervals; below, each mode enlarged.",
         )
-    if campaign.headline is not None:
+    if campaign.freest is not None:
         yield Illustration(
             "pooled_response",
             partial(response_figure, campaign),

@@ -297,7 +297,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     assert exact["condition"] == "if the beam is uniform to 1e-5"
     for name, quantity in exact["parameters"].items():
         if quantity["interval_95"] is not None:
-            own = found.headline.parameters_by_name[name]
+            own = found.freest.parameters_by_name[name]
             assert quantity["interval_95"] == list(own.interval)
             assert shared["parameters"][name]["std"] >= 0.9 * quantity["std"]
     assert shared["covariance"]["names"][0] == "ln_zeta"

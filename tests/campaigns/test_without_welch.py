@@ -33,9 +33,9 @@ def found(make_file, tmp_path_factory, campaign_of):
 def test_only_whole_records_are_pooled(found, truth):
     assert found.failures == ()
     assert (found.nominal, found.statistics) == ((), ())
-    assert found.headline.name == "VI"
+    assert found.freest.name == "VI"
     _, damping = truth
-    zeta = found.headline.parameters_by_name["zeta"]
+    zeta = found.freest.parameters_by_name["zeta"]
     assert zeta.interval[0] < damping.zeta < zeta.interval[1]
     for session in found.sessions:
         assert session.warnings[-1].startswith("Welch fits left out: a multisine")

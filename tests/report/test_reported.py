@@ -144,7 +144,10 @@ def test_loss_factor_of_an_assumed_order_has_its_reason(record_result, with_sele
 
 
 def test_free_number_of_a_condition_has_its_flag(careful, with_selection):
-    simpler = ConditionalEstimate("VII", {"alpha": 1.0}, careful.whole.headline.parameters)
+    parameters = {
+        name: replace(each, flag=None) for name, each in careful.whole.headline.parameters.items()
+    }
+    simpler = ConditionalEstimate("VII", {"alpha": 1.0}, parameters)
     headline = replace(careful.whole.headline, simpler=simpler)
     _, tables, _ = report_tables(with_selection(careful, headline=headline))
     (table,) = [table for table in tables if table.name == "on_condition"]
@@ -153,6 +156,14 @@ def test_free_number_of_a_condition_has_its_flag(careful, with_selection):
         assert row["remark"] == (REASON if is_flagged else "")
         assert row["free_value"].text.endswith(NOT_REPORTED_MARK) == is_flagged
         assert not row["value"].is_doubtful
+    misread = headline.with_flag_on_all("a sign is wrong")
+    _, tables, _ = report_tables(with_selection(careful, headline=misread))
+    (table,) = [table for table in tables if table.name == "on_condition"]
+    for row in table.rows:
+        assert row["value"].is_doubtful
+        assert row["remark"] == "a sign is wrong"
+    inertias = [mode.participation for mode in misread.modes if mode.participation]
+    assert {inertia.flag for inertia in inertias} <= {"a sign is wrong"}
 
 
 def test_order_of_absent_damping_is_not_determined(record_result, with_selection):
