@@ -23,7 +23,7 @@ def found(make_file, tmp_path_factory, campaign_of):
         operator="Eve", note="[clamp] <b>new</b>",
     )  # fmt: skip
     first = analyse_session(path, SessionTask(WelchSettings(types=("I",)), ("III",), (), None))
-    experiment = replace(first.experiment, identity=("1.mcap",))
+    experiment = replace(first.experiment, session_identifiers=("1.mcap",))
     other = replace(
         first, path=path.with_name("1.mcap"), experiment=experiment, sample_digests=frozenset()
     )
@@ -76,7 +76,7 @@ def test_odd_session_is_set_aside_without_affecting_others(make_session, campaig
     sessions = [make_session(f"{number}.mcap") for number in range(3)]
     odd = replace(
         sessions[0].without_welch(), path=Path("odd.mcap"), warnings=("Welch fits left out: x.",),
-        experiment=replace(sessions[0].experiment, identity=("odd",)),
+        experiment=replace(sessions[0].experiment, session_identifiers=("odd",)),
     )  # fmt: skip
     found = campaign_of([*sessions, odd])
     used, (failure,) = found.sessions, found.failures
