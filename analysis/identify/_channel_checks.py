@@ -3,7 +3,8 @@
 Sign and unit are checked by the ratio of the measured response, torque over angle, to the response
 of the beam that the file states. The median of this ratio over the band depends neither on the
 exact mode frequencies nor on the damping. The magnitude of a noisy ratio is too large on average.
-It is therefore averaged over adjacent frequencies, and weighted by the expected torque.
+It is therefore averaged over adjacent frequencies, and where the expected torque is small it has a
+smaller weight. Resonances have no larger weight than others: their frequencies may differ.
 """
 
 from __future__ import annotations
@@ -107,8 +108,12 @@ _ASSUMED_INTERNAL_DAMPING_S: Final = 1e-4
 _MIN_DRIVEN_POWER_FRACTION: Final = 1e-3
 """Minimum power of the angle at a frequency that is used, relative to the largest power."""
 
-_AVERAGED_FREQUENCIES: Final = 16
-"""Number of adjacent frequencies over which the ratio of torque to angle is averaged."""
+_MAX_GROUP_SIZE: Final = 16
+"""Largest number of adjacent frequencies over which the ratio of torque to angle is averaged."""
+
+_MIN_GROUPS: Final = 64
+"""Smallest number of such averages, if there are as many frequencies: in a short record, an average
+over more of them would be that of a whole resonance."""
 
 _MIN_PHASE_COSINE: Final = 0.7
 """Minimum magnitude of the median cosine of the phase between measured and expected response at
@@ -151,7 +156,8 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
         Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S),
     )
     expected_torque = angle_spectrum[is_driven_bin] * expected_response
-    first_frequencies = np.arange(0, expected_torque.size, _AVERAGED_FREQUENCIES)
+    group_size = max(1, min(_MAX_GROUP_SIZE, expected_torque.size // _MIN_GROUPS))
+    first_frequencies = np.arange(0, expected_torque.size, group_size)
     expected_power = np.add.reduceat(np.abs(expected_torque) ** 2, first_frequencies)
     torque_ratio = (
         np.add.reduceat(torque_spectrum[is_driven_bin] * expected_torque.conj(), first_frequencies)
@@ -175,7 +181,10 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
                 "the beam towards positive angles."
             ),
         )
-    median_magnitude = _weighted_median(ratio_magnitude, np.sqrt(expected_power))
+    expected_rms = np.sqrt(expected_power)
+    median_magnitude = _weighted_median(
+        ratio_magnitude, np.minimum(expected_rms, np.median(expected_rms))
+    )
     if not median_magnitude > 0 or abs(math.log(median_magnitude)) < _MIN_LOG_UNIT_FACTOR:
         return
     log_differences = {
