@@ -303,7 +303,7 @@ def weighting_name(weighting: Weighting) -> str:
     Raises
     ------
     WeightingError
-        If no weighting has that name.
+        If `weighting` is a text that does not name a weighting.
 
     Examples
     --------

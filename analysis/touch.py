@@ -574,10 +574,10 @@ def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, touch_time_s: f
     fit_sample_count = min(
         max(int(touch_time_s * record.rate_hz) - 1, _MIN_FIT_SAMPLES), record.detection_index
     )
-    free_motion = free_beam.motion(record, fit_sample_count, fit_sample_count - 4)
-    step_index = round((touch_time_s - free_motion.first_s) / free_motion.step_s)
-    displacement_m: RealArray = free_motion.displacement_m[
-        :, min(max(step_index, 0), free_motion.displacement_m.shape[1] - 1)
+    motion_without_touch = free_beam.motion(record, fit_sample_count, fit_sample_count - 4)
+    step_index = round((touch_time_s - motion_without_touch.first_s) / motion_without_touch.step_s)
+    displacement_m: RealArray = motion_without_touch.displacement_m[
+        :, min(max(step_index, 0), motion_without_touch.displacement_m.shape[1] - 1)
     ]
     times_s = np.arange(record.angle_rad.size) / record.rate_hz
     return (

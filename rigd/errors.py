@@ -56,7 +56,7 @@ class RigdError(Exception):
     """Whether the request must be changed; otherwise the same request may succeed later."""
 
     def full_message(self) -> str:
-        """Return the message for the operator; an override may check further facts for seconds."""
+        """Return the message for the operator; overrides may take seconds to check more facts."""
         return str(self)
 
 

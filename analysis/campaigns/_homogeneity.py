@@ -1,4 +1,4 @@
-"""Homogeneity of a campaign: whether its sessions are of one specimen, by files and by estimates.
+"""Homogeneity of a campaign: whether files and estimates agree with a single specimen.
 
 Each mode and each parameter is tested by itself with Cochran's Q and with I², the fraction of the
 variance between sessions that their own uncertainties do not explain [1]_.

@@ -94,21 +94,21 @@ def random_effects(
 
     # Values are in units of a typical standard deviation, as parameters differ by orders of
     # magnitude.
-    parameter_scales = 1 / np.sqrt(weights.mean(axis=0))
-    scale_products = np.outer(parameter_scales, parameter_scales)
+    typical_stds = 1 / np.sqrt(weights.mean(axis=0))
+    std_products = np.outer(typical_stds, typical_stds)
     mean_estimate = estimates.mean(axis=0)
     own_covariances, total_covariances = (
-        covariances / scale_products,
-        covariances / scale_products + np.diag(between_variance / parameter_scales**2),
+        covariances / std_products,
+        covariances / std_products + np.diag(between_variance / typical_stds**2),
     )
-    deviations = (estimates - mean_estimate) / parameter_scales
+    deviations = (estimates - mean_estimate) / typical_stds
     mean_shift, mean_covariance, squared_deviations = _weighted_mean(deviations, total_covariances)
     log_determinants = float(
         (np.linalg.slogdet(total_covariances)[1] - np.linalg.slogdet(own_covariances)[1]).sum()
     )
     return RandomEffects(
-        mean=mean_estimate + parameter_scales * mean_shift,
-        covariance=scale_products * mean_covariance,
+        mean=mean_estimate + typical_stds * mean_shift,
+        covariance=std_products * mean_covariance,
         between_session_std=np.sqrt(between_variance),
         cochran_q=q,
         deviance=min(

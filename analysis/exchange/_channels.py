@@ -287,7 +287,7 @@ class Timebase:
 
     @property
     def missing_ticks(self) -> int:
-        """Number of ticks between the first and the last that have no sample."""
+        """Number of ticks without a sample between the first and the last sample."""
         return int(self.ticks[-1]) + 1 - len(self.ticks)
 
 

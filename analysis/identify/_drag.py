@@ -193,7 +193,7 @@ class _DragFitStart:
 
     @classmethod
     def from_refit(cls, refit: Refit) -> _DragFitStart:
-        """Return the minimum of a refit as the start of the next fit with drag."""
+        """Return plant, drag law and noise at the minimum of a refit, to start the next fit."""
         structure = refit.objective.unknowns.structure
         has_two_coefficients = len(refit.effect_spectra) > 1
         return cls(

@@ -155,9 +155,9 @@ class DragExpansion:
     def _external_damping_terms(self, plant: Plant) -> list[RealArray]:
         """Return the external damping of another beam minus that of this beam, for two modes.
 
-        The difference is taken at the pole of each mode, without an expansion in the order:
+        The difference is taken at the pole of each mode, without an expansion in lambda:
         ``gamma s^lambda`` is not linear in lambda, and a fit with insignificant external damping
-        may reach any order.
+        may move lambda anywhere in its range.
 
         For each mode, the difference is ``c_0 + c_1 s``. The rows of an array of shape (2, 3) are
         c_0 and c_1, each with its derivatives by gamma and lambda.

@@ -313,7 +313,7 @@ class _ModalSearch:
         mode_starts: Sequence[tuple[int, float, float]],
         torque_spectra: NDArray[np.complex128] | None = None,
     ) -> _ModalSearch | None:
-        """Return the search that starts at the modes in the band, or None if there is none."""
+        """Return a search that starts at the modes in the band; None if no mode is in the band."""
         starts_in_band = [
             mode_start for mode_start in mode_starts if mode_start[1] <= comparison.frequency_hz[-1]
         ]

@@ -226,11 +226,11 @@ def mode_numbers_changed_by_drag(modal_fit: ModalFit, fit_with_drag: ModalFit) -
         fit_with_drag.visible_mode_numbers
     ):
         mode_without_drag = modal_fit.mode(mode_number)
-        damping_ratio_change = (
+        damping_ratio_reduction = (
             mode_without_drag.damping_ratio - fit_with_drag.mode(mode_number).damping_ratio
         )
         if (
-            abs(damping_ratio_change)
+            abs(damping_ratio_reduction)
             > _MIN_CHANGED_DAMPING_STDS * mode_without_drag.damping_ratio_std
         ):
             changed_mode_numbers.append(mode_number)

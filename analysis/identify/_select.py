@@ -210,10 +210,11 @@ class _Assessment(Generic[_ResultT]):
 def _assess_with_impacts(
     measurement: Measurement, assess_measurement: Callable[[Measurement], _Assessment[_ResultT]]
 ) -> _Assessment[_ResultT]:
-    """Select the model of a record, and again with each impact that may explain its residual.
+    """Select the model of a record; add impacts one by one while they explain its residual.
 
-    `assess_measurement` is the selection for a measurement whose known impacts are fitted. Return
-    the last result that was improved by an impact.
+    An impact is added if it is evident, or if the residual is noise with it. `assess_measurement`
+    is the selection for a measurement whose known impacts are fitted. Return its result with all
+    added impacts, or that without impacts if none was added.
     """
     assessment = assess_measurement(measurement)
     for _ in range(MAX_IMPACTS):

@@ -176,9 +176,10 @@ class Unknowns:
         Parameters
         ----------
         plant : Plant
-            Plant with damping of any structure. If the structure of these unknowns fixes another
-            order, the damping keeps its loss at the mode. Absent damping starts small, with order
-            1.
+            Plant with damping of any structure. If the structure of these unknowns fixes an order
+            that differs from the plant's, the loss factor does not change at the second undamped
+            natural frequency (internal damping) or at the first one (external damping). Absent
+            damping starts small, with order 1.
         """
         damping, nominal_beam = plant.damping, self.nominal_plant.beam
         first_omega_rad_s, second_omega_rad_s = self.omega_rad_s

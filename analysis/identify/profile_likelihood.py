@@ -158,10 +158,11 @@ def profile(
     """Compute the profile likelihood of one order of a candidate.
 
     The order is varied from the minimum in both directions until the record excludes the values
-    beyond. It is freed in the structure of `candidate`, if it is not free. Each refit starts on the
-    tangent of the last one, and each step goes to the value at which a parabolic deviance would
-    reach the next level. If much of the range is admitted and `search_other_minima` is set, the
-    remaining range is searched for another local minimum, from which the order is varied as well.
+    beyond. It is freed in the structure of `candidate`, if it is not free. Each refit starts from
+    unknowns extrapolated linearly from the last one, and each step goes to the value at which a
+    parabolic deviance would reach the next level. If much of the range is admitted and
+    `search_other_minima` is set, the remaining range is searched for another local minimum, from
+    which the order is varied as well.
 
     Parameters
     ----------
@@ -546,14 +547,14 @@ class OrderProfiler:
             self.costs[self._minimum_order] * math.exp(HOPELESS_BIC_DIFFERENCE / self._value_count),
         )
         refit = self._descend(
-            self._tangent(order_value, nearest_refit),
+            self._extrapolated_unknowns(order_value, nearest_refit),
             _MAX_EVALUATIONS,
             held_unknowns=fixed_names,
             hopeless=(_TRIAL_EVALUATIONS, highest_cost),
         )
         if refit.cost > highest_cost:
-            # Near 0 and 2 damping acts as stiffness or inertia, and the tangent may lead to a point
-            # from which no descent converges. So all other unknowns keep their values.
+            # Near 0 and 2 damping acts as stiffness or inertia, and the extrapolation may lead to a
+            # point from which no descent converges. So all other unknowns keep their values.
             refit = self._better_refit(
                 refit, nearest_refit, order_value, (_TRIAL_EVALUATIONS, highest_cost)
             )
@@ -614,7 +615,9 @@ class OrderProfiler:
             give_up_condition=hopeless,
         )
 
-    def _tangent(self, order_value: float, nearest_refit: Refit) -> NDArray[np.float64]:
+    def _extrapolated_unknowns(
+        self, order_value: float, nearest_refit: Refit
+    ) -> NDArray[np.float64]:
         """Extrapolate the optimal unknowns linearly to another value of the order, shape (k,)."""
         x, order_index = nearest_refit.x.copy(), self._order_index
         scaled_hessian, hessian_scale = nearest_refit.equations.scaled_hessian()

@@ -47,8 +47,8 @@ _DOUBTFUL_PROBABILITY: Final = 0.01
 """Probability of chance below which a residual is doubtful. A false alarm costs only computing time
 there."""
 
-_MIN_LOUD_POWER_RATIO_BY_BINS: Final = {8: 5.0, 32: 2.6}
-"""Power over that of the noise from which a window of 8 or 32 bins is loud. One record of white
+_MAX_POWER_RATIO_BY_WINDOW_BINS: Final = {8: 5.0, 32: 2.6}
+"""Power over that of the noise above which a window of 8 or 32 bins is loud. One record of white
 noise in 5000 has such a window (of 12 000 records with the noise estimated from medians of 60
 bins). Such an estimate is uncertain by up to 18 %: with the limits for a noise that is known
 exactly, 4.3 and 2.3, one record in 160 would be loud."""
@@ -171,20 +171,22 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
     bin_power = residual.real**2 + residual.imag**2
     cumulative_power = np.concatenate([[0.0], np.cumsum(bin_power)])
     largest_deviate, loudest_hz, loudest_ratio, is_loud = -math.inf, (0.0, 0.0), 1.0, False
-    for window_bins, loud_ratio in _MIN_LOUD_POWER_RATIO_BY_BINS.items():
+    for window_bins, max_power_ratio in _MAX_POWER_RATIO_BY_WINDOW_BINS.items():
         if window_bins >= bin_count:
             continue
         window_power = cumulative_power[window_bins:] - cumulative_power[:-window_bins]
-        loudest_start = int(np.argmax(window_power))
-        window_deviate = chi_square_deviate(float(window_power[loudest_start]), 2 * window_bins)
+        loudest_window_index = int(np.argmax(window_power))
+        window_deviate = chi_square_deviate(
+            float(window_power[loudest_window_index]), 2 * window_bins
+        )
         if window_deviate > largest_deviate:
             largest_deviate = window_deviate
             loudest_hz = (
-                float(frequency_hz[loudest_start]),
-                float(frequency_hz[loudest_start + window_bins - 1]),
+                float(frequency_hz[loudest_window_index]),
+                float(frequency_hz[loudest_window_index + window_bins - 1]),
             )
-            loudest_ratio = float(window_power[loudest_start]) / (2 * window_bins)
-        is_loud |= float(window_power[loudest_start]) / (2 * window_bins) > loud_ratio
+            loudest_ratio = float(window_power[loudest_window_index]) / (2 * window_bins)
+        is_loud |= float(window_power[loudest_window_index]) / (2 * window_bins) > max_power_ratio
     return Whiteness(
         distance=largest_distance,
         band=KOLMOGOROV_95 / math.sqrt(bin_count),

@@ -50,7 +50,7 @@ def estimate(
 
     Returns
     -------
-    main_response, whole_record : FrequencyResponse
+    response_to_fit, whole_record_response : FrequencyResponse
         Responses in the band of the settings, without the channels' delays. With the estimator
         "fft", both are the same.
 
@@ -68,16 +68,16 @@ def estimate(
     # A constant angle causes no torque, but would leak into the lowest bins of both responses.
     relative_angle_rad = record.angle_rad - (record.rest_angle_rad or 0.0)
     try:
-        whole_record = fft_response(
+        whole_record_response = fft_response(
             relative_angle_rad,
             record.torque_nm,
             record.rate_hz,
             max(segmentation.nfft, len(relative_angle_rad)),
         )
         if settings.estimator == "fft":
-            main_response = whole_record
+            response_to_fit = whole_record_response
         elif settings.estimator == "iv":
-            main_response = instrumental_response(
+            response_to_fit = instrumental_response(
                 _relative_reference_rad(record)[record.first_sweep],
                 relative_angle_rad[record.first_sweep],
                 record.torque_nm[record.first_sweep],
@@ -85,7 +85,7 @@ def estimate(
                 **asdict(segmentation),
             )
         else:
-            main_response = welch_response(
+            response_to_fit = welch_response(
                 relative_angle_rad[record.first_sweep],
                 record.torque_nm[record.first_sweep],
                 record.rate_hz,
@@ -95,23 +95,23 @@ def estimate(
     except SpectralError as error:
         raise FrequencyResponseError(f"{record.path}: {error}") from error
     try:
-        main_response, whole_record = (
+        response_to_fit, whole_record_response = (
             estimated_response.band(*settings.band_hz).without_delays(
                 input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
             )
-            for estimated_response in (main_response, whole_record)
+            for estimated_response in (response_to_fit, whole_record_response)
         )
     except SpectralError as error:
         raise SettingsError(f"{record.path}: {error}") from error
-    not_finite_bins = np.flatnonzero(~np.isfinite(main_response.response))
+    not_finite_bins = np.flatnonzero(~np.isfinite(response_to_fit.response))
     if not_finite_bins.size:
         raise FrequencyResponseError(
             f"{record.path}: the angle has no power at "
-            f"{main_response.frequency_hz[not_finite_bins[0]]:g} "
+            f"{response_to_fit.frequency_hz[not_finite_bins[0]]:g} "
             "Hz, "
             "so there is no frequency response there; choose a --band that was excited."
         )
-    return main_response, whole_record
+    return response_to_fit, whole_record_response
 
 
 def _relative_reference_rad(record: Record) -> NDArray[np.float64]:

@@ -407,13 +407,15 @@ def analyse(record: Record, settings: WelchSettings) -> WelchAnalysis:
         The motor did not move, or the record is too short for the segments.
     """
     _check_excitation(record)
-    main_response, whole_record = estimate(record, settings)
-    measured_peaks = _mode_peaks(record.beam, main_response.frequency_hz, main_response.response)
-    response_grid = ResponseGrid(2j * np.pi * main_response.frequency_hz)
+    response_to_fit, whole_record_response = estimate(record, settings)
+    measured_peaks = _mode_peaks(
+        record.beam, response_to_fit.frequency_hz, response_to_fit.response
+    )
+    response_grid = ResponseGrid(2j * np.pi * response_to_fit.frequency_hz)
     try:
         frf_fits = fit_many(
-            main_response.frequency_hz,
-            main_response.response,
+            response_to_fit.frequency_hz,
+            response_to_fit.response,
             record.beam,
             [STRUCTURES[name] for name in settings.types],
             settings.weightings,
@@ -425,14 +427,14 @@ def analyse(record: Record, settings: WelchSettings) -> WelchAnalysis:
         record=record,
         settings=settings,
         segmentation=settings.segmentation(record.rate_hz),
-        response=main_response,
-        whole_record=whole_record,
+        response=response_to_fit,
+        whole_record=whole_record_response,
         peaks=measured_peaks,
         models=tuple(
-            _evaluate_fit(fit, record, main_response, response_grid, measured_peaks)
+            _evaluate_fit(fit, record, response_to_fit, response_grid, measured_peaks)
             for fit in frf_fits
         ),
-        warnings=record.warnings + estimate_warnings(record, settings, main_response),
+        warnings=record.warnings + estimate_warnings(record, settings, response_to_fit),
     )
 
 

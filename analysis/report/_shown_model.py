@@ -122,7 +122,7 @@ class ShownModel:
 
 
 def shown_modes(headline: Headline) -> tuple[ModeEstimate, ...]:
-    """Return the reported modes that are visible in the record, with standard deviations."""
+    """Return the reported modes that are visible in the record, each with its uncertainties."""
     return tuple(
         ModeEstimate(
             number=mode.number,

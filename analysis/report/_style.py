@@ -264,8 +264,8 @@ def save_pictures(
 ) -> list[Picture]:
     """Draw figures, write each in several formats, and return them for a page.
 
-    The names of the figures differ. After each figure, `on_step` is called with a short text. A
-    picture is an SVG image, which can be searched and is sharp on paper. It is a PNG image if SVG
+    No two figures may have the same name. After each figure, `on_step` is called with a short text.
+    A picture is an SVG image, which can be searched and is sharp on paper. It is a PNG image if SVG
     was not among the formats, or if the SVG image is large. Raise `OutputError` if a file exists or
     cannot be written.
     """

@@ -116,7 +116,7 @@ class Plant:
         Raises
         ------
         ValueError
-            If a plant has no parameter of such a name.
+            If a name is not that of a plant's parameter.
         """
         return cls(Beam(length_m, 1.0, 1.0), Damping()).with_parameters(values)
 
@@ -126,13 +126,13 @@ class Plant:
         Parameters
         ----------
         values
-            Values by the names of `parameters`. A change of the density over stiffness leaves the
-            bending stiffness unchanged, and vice versa.
+            Values by the names of `parameters`. A change of the ratio ``density_over_stiffness``
+            leaves the bending stiffness unchanged, and vice versa.
 
         Raises
         ------
         ValueError
-            If a plant has no parameter of such a name.
+            If a name is not that of a plant's parameter.
         """
         attribute_changes: dict[str, Any] = {}
         damping_changes: dict[str, float] = {}

@@ -46,7 +46,7 @@ def serve(
     live: Annotated[
         bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
     ] = False,
-    web: Annotated[
+    is_page_requested: Annotated[
         bool, typer.Option("--web", help="Serve the operator's page on this computer.")
     ] = False,
     web_port: Annotated[
@@ -71,7 +71,7 @@ def serve(
     from rigd.daemon import run_daemon
     from rigd.runner.request import load_rig, make_folder
 
-    serves_page = web or web_port is not None
+    serves_page = is_page_requested or web_port is not None
     if live:
         require_extra("live", "--live")
     if serves_page:

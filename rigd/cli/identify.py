@@ -137,7 +137,11 @@ def _run_sessions(
     """
     stop_request, process_group = start_processes(with_live_view=False)
     from rigd.identification import with_cautious_controller, with_tuned_controller
-    from rigd.identification.experiments import multisine_session, speeds_session, trial_session
+    from rigd.identification.experiments import (
+        constant_speeds_excitation,
+        multisine_excitation,
+        trial_excitation,
+    )
     from rigd.runner import ProcessGroup, run_in_foreground
     from rigd.runtime import ignore_end_signals
 
@@ -177,7 +181,9 @@ def _run_sessions(
         return file_path
 
     try:
-        trial_path = run_numbered_session(trial_session, with_cautious_controller, 0, process_group)
+        trial_path = run_numbered_session(
+            trial_excitation, with_cautious_controller, 0, process_group
+        )
         motor_estimate = _estimate_motor([trial_path], profile_name)[0]
 
         def tune_profile(profile: "Profile") -> "Profile":
@@ -188,7 +194,7 @@ def _run_sessions(
                 session_builder, tune_profile, session_number, ProcessGroup(with_live_view=False)
             )
             for session_number, session_builder in enumerate(
-                (multisine_session, speeds_session), start=1
+                (multisine_excitation, constant_speeds_excitation), start=1
             )
         ]
     finally:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.daemon._log import LOGGER_NAME
-from rigd.engine.messages import PageAddress, ProcessFailed
+from rigd.engine.messages import OperatorPageServed, ProcessFailed
 from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import PAGE
 from rigd.runtime.addresses import (
@@ -107,7 +107,7 @@ class PageProcess:
             page_process.start(self._job)
             while True:
                 match page_process.poll(None):
-                    case PageAddress(port):
+                    case OperatorPageServed(port):
                         self._announce_page(port)
                     case ProcessFailed(failure_text):
                         pass

@@ -435,7 +435,7 @@ def _to_signed(integer_value: int | None, data_type: int) -> int | None:
 def _identity_number(
     entries: Mapping[tuple[int, int], EdsEntry], subindex: int, header_text: str
 ) -> int:
-    """Return a number of the drive's identity: from object 1018, or else from `header_text`."""
+    """Return one of the drive's identity numbers: from object 1018, or else `header_text`."""
     identity_entry = entries.get((0x1018, subindex))
     identity_value = (
         identity_entry.default_value if identity_entry else None

@@ -123,7 +123,7 @@ def run_control(
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
-        _publish_phase_if_off(channels, devices)
+        _publish_drive_off_if_certain(channels, devices)
         server = _ControlServer(
             profile, devices, clock, channels, parent, stop_request, realtime_results
         )
@@ -144,7 +144,7 @@ def run_control(
     finally:
         devices.drive.disable()
         if channels.shared_state[StateField.PHASE] != Phase.PREPARING:  # it was connected
-            _publish_phase_if_off(channels, devices)
+            _publish_drive_off_if_certain(channels, devices)
         devices.drive.close()
         devices.sensor.close()
     if server is not None:
@@ -152,7 +152,7 @@ def run_control(
     parent.send(ControlEnded(f"{end_reason_text} {devices.drive.off_doubt}".strip()))
 
 
-def _publish_phase_if_off(channels: Channels, devices: Devices) -> None:
+def _publish_drive_off_if_certain(channels: Channels, devices: Devices) -> None:
     """Publish that the disabled drive is off, unless it has not shown this.
 
     Displays claim that the torque is off in this phase, and ``rigd stop`` by this process name.
@@ -361,7 +361,7 @@ class _ControlServer:
         finally:
             devices.drive.disable()
             cycle.switch_torque_off()
-            _publish_phase_if_off(self._channels, devices)
+            _publish_drive_off_if_certain(self._channels, devices)
             self._publish_readings()
         off_doubt = devices.drive.off_doubt
         if off_doubt:
@@ -432,7 +432,7 @@ class _ControlServer:
         finally:
             self._devices.drive.disable()
             cycle.switch_torque_off()
-            _publish_phase_if_off(self._channels, self._devices)
+            _publish_drive_off_if_certain(self._channels, self._devices)
             self._publish_readings()
         failure_text = f"{failure_text} {self._devices.drive.off_doubt}".strip()
         if failure_text:

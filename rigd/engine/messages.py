@@ -382,7 +382,7 @@ class SearchEnded:
 
 
 @dataclass(frozen=True, slots=True)
-class PageAddress:
+class OperatorPageServed:
     """Message that the operator's page is served."""
 
     port: int

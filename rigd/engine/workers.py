@@ -165,7 +165,7 @@ switches the torque off."""
 PAGE: Final = Worker(
     name="page",
     module="rigd.web",
-    sent_messages=("PageAddress", "ProcessFailed"),
+    sent_messages=("OperatorPageServed", "ProcessFailed"),
     loss_severity="warning",
     consequence="It is not started again; the rig does not need it.",
     restarts=4,

@@ -230,7 +230,7 @@ class BeamEstimate:
         derivative_names = [
             gradient_name(name) for name in self.free_parameters if name in FIT_PARAMETERS
         ]
-        parameter_factors = parameter_scales(self)
+        parameter_factors = fit_parameter_factors(self)
         estimated_modes = []
         for pole in self.plant.mode_poles(mode_count, derivative_names):
             if not 0.0 < pole.at_rad_s.imag < 2 * pi * highest_hz:
@@ -259,7 +259,7 @@ POLE_AND_RESIDUE_DERIVATIVES: Final[
 derivatives of both with respect to the constant."""
 
 
-def parameter_scales(estimate: BeamEstimate) -> RealArray:
+def fit_parameter_factors(estimate: BeamEstimate) -> RealArray:
     """Return the factors that convert derivatives for model parameters to those for fit parameters.
 
     The fit uses the logarithms of zeta and gamma, so their factors are zeta and gamma. The other

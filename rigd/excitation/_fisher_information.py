@@ -33,7 +33,7 @@ from rigd.excitation._beam_estimate import (
     BeamEstimate,
     ComplexArray,
     RealArray,
-    parameter_scales,
+    fit_parameter_factors,
 )
 
 _PRIOR_STD_BY_PARAMETER: Final = {
@@ -106,7 +106,7 @@ class TorqueModel:
 
     @property
     def sample_hz(self) -> float:
-        """Rate of the samples in Hz, at which derivatives of the torque are computed."""
+        """Rate in Hz at which the torque's derivatives by the parameters are computed."""
         return self.rate_hz / self.ticks_per_model_sample
 
     def spectrum(self, angle_rad: RealArray) -> ComplexArray:
@@ -176,10 +176,10 @@ def whitened_kernels(estimate: BeamEstimate, s: ComplexArray, sample_hz: float) 
     )
     derivative_kernels[len(parameter_names) :] = _modal_derivatives(estimate, s) * channel_response
     gradient_rows = iter(beam_gradient)
-    for out, parameter_name, parameter_scale in zip(
+    for out, parameter_name, parameter_factor in zip(
         derivative_kernels[: len(parameter_names)],
         parameter_names,
-        parameter_scales(estimate),
+        fit_parameter_factors(estimate),
         strict=True,
     ):
         if parameter_name == "delay_s":
@@ -187,7 +187,7 @@ def whitened_kernels(estimate: BeamEstimate, s: ComplexArray, sample_hz: float) 
         elif parameter_name == "tool_inertia_kg_m2":
             out[:] = s * s * channel_response
         else:
-            out[:] = parameter_scale * next(gradient_rows) * channel_response
+            out[:] = parameter_factor * next(gradient_rows) * channel_response
     derivative_kernels *= _whitening_weights(estimate, s.imag / (2 * pi), sample_hz)
     return derivative_kernels
 
@@ -246,15 +246,19 @@ def _whitening_weights(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordSoFar:
-    """Whitened torque derivatives of a record so far, and the vibration that continues after it."""
+    """Whitened derivatives of a record's torque by the parameters, and the vibration after it.
+
+    The record ends now. The vibration continues while the motor is held.
+    """
 
     estimate: BeamEstimate
     """Estimate of the beam from which the information is computed."""
     past_gram_matrix: RealArray
-    """Gram matrix of the record's k torque derivatives and m nuisance terms, shape
+    """Gram matrix of the derivatives by k parameters and of m nuisance terms, shape
     (k + m, k + m)."""
     future_derivatives: RealArray
-    """Derivatives and nuisance terms from now on if the motor is held, shape (k + m, samples)."""
+    """Derivatives by the parameters, and nuisance terms, from now on if the motor is held, shape
+    (k + m, samples)."""
     ringing_motion: RealArray
     """Torque in N·m and slope of the tip in rad from now on if the motor is held, shape
     (2, ticks)."""

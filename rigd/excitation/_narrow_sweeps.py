@@ -331,13 +331,13 @@ def time_fractions(
     information_rates, damping_count = _information_rates(
         sweep_bands, amplitudes_rad, rig, beam_damping
     )
-    parameter_scales = np.sqrt(np.einsum("bii->i", information_rates))
-    information_rates = information_rates / np.outer(parameter_scales, parameter_scales)
+    parameter_norms = np.sqrt(np.einsum("bii->i", information_rates))
+    information_rates = information_rates / np.outer(parameter_norms, parameter_norms)
     band_time_fractions = np.full(len(sweep_bands), 1.0 / len(sweep_bands))
     for _ in range(_TIME_DIVISION_STEPS):
         information = np.tensordot(band_time_fractions, information_rates, axes=1)
         covariance = np.linalg.inv(
-            information + _INFORMATION_REGULARISATION * np.eye(len(parameter_scales))
+            information + _INFORMATION_REGULARISATION * np.eye(len(parameter_norms))
         )
         gain_directions = covariance[:damping_count]
         precision_gains = (

@@ -81,7 +81,7 @@ class ScanRig(DesignRig, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PrecisionSearch:
-    """Target standard deviations at which a session ends, and its planned quick sweep.
+    """Plan of a session that ends at target standard deviations, and begins with a quick sweep.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class PrecisionExcitation(Excitation):
     Attributes
     ----------
     search
-        Target standard deviations, and the planned quick sweep.
+        Plan of the session: the target standard deviations, and the quick sweep at its beginning.
     """
 
     search: PrecisionSearch

@@ -134,23 +134,25 @@ def passes_of_schedule(schedule: PassSchedule, rate_hz: float) -> list[SpeedPass
     return speed_passes
 
 
-def trial_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
+def trial_excitation(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
     """Return the excitation of the trial, a short session with little speed modulation.
 
     The controller of the other sessions is designed from the estimate of the trial. The excitation
-    and its errors are otherwise those of `multisine_session`.
+    and its errors are otherwise those of `multisine_excitation`.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     torque_percent, stroke_rad
-        Limits of torque and angle as for `multisine_session`.
+        Limits of torque and angle as for `multisine_excitation`.
     """
-    return _multisine_excitation(TRIAL_EXCITATION, profile, torque_percent, stroke_rad)
+    return _passes_with_multisine(TRIAL_EXCITATION, profile, torque_percent, stroke_rad)
 
 
-def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
+def multisine_excitation(
+    profile: Profile, *, torque_percent: float, stroke_rad: float
+) -> Excitation:
     """Return passes to and fro with a multisine that is scaled to the allowed torque.
 
     The predicted speed has equal amplitudes at all harmonics of the window, with the phases of
@@ -172,10 +174,10 @@ def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: fl
     ControlDesignError
         If the profile's loop cannot be closed.
     """
-    return _multisine_excitation(MULTISINE_EXCITATION, profile, torque_percent, stroke_rad)
+    return _passes_with_multisine(MULTISINE_EXCITATION, profile, torque_percent, stroke_rad)
 
 
-def _multisine_excitation(
+def _passes_with_multisine(
     excitation_name: str, profile: Profile, torque_percent: float, stroke_rad: float
 ) -> Excitation:
     """Return the excitation of the trial or of the multisine: passes with a multisine."""
@@ -216,7 +218,9 @@ def _multisine_excitation(
     )
 
 
-def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
+def constant_speeds_excitation(
+    profile: Profile, *, torque_percent: float, stroke_rad: float
+) -> Excitation:
     """Return passes to and fro at four constant speeds.
 
     Parameters
@@ -224,7 +228,7 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
     profile
         Profile of the rig.
     torque_percent, stroke_rad
-        Limits of torque and angle as for `multisine_session`.
+        Limits of torque and angle as for `multisine_excitation`.
 
     Raises
     ------

@@ -117,7 +117,11 @@ def _searchable_text(row: SessionRow) -> str:
 
 
 def _parse_time_ns(given_time: str | datetime | None, argument_name: str) -> int | None:
-    """Return a time in ns since 1970; for a date, the start of the day or, if `until`, its end."""
+    """Return a time in ns since 1970, or None if no time is given.
+
+    A date without a time of day means the end of the day for the argument ``until``, else its
+    start.
+    """
     if given_time is None or given_time == "":
         return None
     try:

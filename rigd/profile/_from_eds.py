@@ -175,7 +175,7 @@ class Draft:
         )
 
     def unaccepted_findings(self) -> list[SuitabilityFinding]:
-        """Return the missing features of the drive for which the draft would be refused.
+        """Return the features that the drive lacks and without which the draft would be refused.
 
         Raises
         ------

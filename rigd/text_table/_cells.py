@@ -118,8 +118,8 @@ class ThousandsCheck:
 def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
     """Return whether commas in decimal numbers (0,025) were taken as separators of cells.
 
-    Every line then has an even number of cells without a decimal sign. The second cell of each pair
-    is an unsigned integer. At least one of these has a leading zero, which no integer has.
+    They were if every line consists of pairs of cells, an integer and the digits after the comma.
+    In at least one pair these digits must begin with a zero (025), unlike an integer.
     """
     has_leading_zero = False
     for row in rows:

@@ -33,15 +33,15 @@ class ImpactResponse:
 
     def predict(self, parameters: RealArray, sample_window: WhitenedWindow) -> RealArray:
         """Return the effect of impacts (k, 4) on torque and base shear, shape (k, c, samples)."""
-        free_motion = sample_window.motion
-        last_time_s = free_motion.t[sample_window.end_sample - 1]
+        motion_without_touch = sample_window.motion
+        last_time_s = motion_without_touch.t[sample_window.end_sample - 1]
         step_count = int(np.ceil((last_time_s - parameters[:, 1].min()) / self._kernels.step_s)) + 3
         step_count = min(step_count, self._kernels.step_count)
         local_kernels = self._kernels.at_positions(parameters[:, 0], step_count)
         pulse_phase = np.arange(step_count) * self._kernels.step_s / np.exp(parameters[:, 2:3])
         forces_n = parameters[:, 3:4] * np.sin(np.pi * np.minimum(pulse_phase, 1.0))
         kernel_tables = (local_kernels.torque_nm_per_n, local_kernels.shear_per_n)[
-            : free_motion.noise_stds.size
+            : motion_without_touch.noise_stds.size
         ]
         return self._contact.force_effects(kernel_tables, forces_n, parameters[:, 1], sample_window)
 

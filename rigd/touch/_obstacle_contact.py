@@ -71,7 +71,7 @@ class WhitenedWindow:
     @classmethod
     def from_motion(
         cls,
-        free_motion: FreeMotion,
+        motion_without_touch: FreeMotion,
         first_sample: int,
         end_sample: int,
         effects_per_std: RealArray | None = None,
@@ -84,19 +84,26 @@ class WhitenedWindow:
         """
         if effects_per_std is None:
             effects_per_std = (
-                free_motion.design_matrices[:, first_sample:end_sample]
-                @ free_motion.amplitude_cholesky
+                motion_without_touch.design_matrices[:, first_sample:end_sample]
+                @ motion_without_touch.amplitude_cholesky
             )
-        noise_stds = free_motion.noise_stds[:, None, None]
+        noise_stds = motion_without_touch.noise_stds[:, None, None]
         scaled_effects = (effects_per_std[:, : end_sample - first_sample] / noise_stds).reshape(
             -1, effects_per_std.shape[2]
         )
         covariance = np.eye(scaled_effects.shape[0]) + scaled_effects @ scaled_effects.T
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         scaled_innovations = (
-            free_motion.innovations[:, first_sample:end_sample] / free_motion.noise_stds[:, None]
+            motion_without_touch.innovations[:, first_sample:end_sample]
+            / motion_without_touch.noise_stds[:, None]
         ).ravel()
-        return cls(free_motion, first_sample, end_sample, whitening, whitening @ scaled_innovations)
+        return cls(
+            motion_without_touch,
+            first_sample,
+            end_sample,
+            whitening,
+            whitening @ scaled_innovations,
+        )
 
     def residuals(self, predicted_effects: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Return the whitened innovations minus the whitened predicted effects, shape (k, n).
@@ -122,13 +129,15 @@ class ObstacleContact:
     """Model of the beam's contact with an obstacle, for the record of one touch.
 
     The kernels have the time steps of the integration; `x_m` are the positions of the displacements
-    in `free_motion`, the motion of the beam without a touch.
+    in `motion_without_touch`, the motion of the beam without a touch.
     """
 
     __slots__ = ("_kernels", "_motion", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, x_m: RealArray, free_motion: FreeMotion) -> None:
-        self._kernels, self._x_m, self._motion = kernels, x_m, free_motion
+    def __init__(
+        self, kernels: ContactKernels, x_m: RealArray, motion_without_touch: FreeMotion
+    ) -> None:
+        self._kernels, self._x_m, self._motion = kernels, x_m, motion_without_touch
 
     def predict(
         self,
@@ -145,7 +154,7 @@ class ObstacleContact:
         the touch. `kernels` are those at the position of a single candidate, by default
         interpolated ones.
         """
-        free_motion = self._motion
+        motion_without_touch = self._motion
         x, instants_s = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
         step_count = self.step_count(instants_s, sample_window)
@@ -164,7 +173,7 @@ class ObstacleContact:
         )
         forces_n = -pressing_signs[:, None] * pressing_force_n
         kernel_tables = (local_kernels.torque_nm_per_n, local_kernels.shear_per_n)[
-            : free_motion.innovations.shape[0]
+            : motion_without_touch.innovations.shape[0]
         ]
         return self.force_effects(kernel_tables, forces_n, instants_s, sample_window), forces_n
 
@@ -234,11 +243,11 @@ class ObstacleContact:
         The tables are the kernel of torque, and of shear if measured, with k rows or one. Forces
         are given at the time steps of the kernels from each instant on, shape (k, n).
         """
-        free_motion = self._motion
+        motion_without_touch = self._motion
         step_s = self._kernels.step_s
-        steps_per_sample = round((free_motion.t[1] - free_motion.t[0]) / step_s)
+        steps_per_sample = round((motion_without_touch.t[1] - motion_without_touch.t[0]) / step_s)
         sample_count = sample_window.end_sample - sample_window.first_sample
-        begin_steps = (free_motion.t[sample_window.first_sample] - instants_s) / step_s
+        begin_steps = (motion_without_touch.t[sample_window.first_sample] - instants_s) / step_s
         # Convolution and shift commute: shifting first puts the steps of all at the samples.
         aligned_forces = shift_rows(
             forces_n, begin_steps, (sample_count - 1) * steps_per_sample + 1
@@ -258,13 +267,15 @@ class ObstacleContact:
         in the direction of the motion. The direction is 1 or -1, by default that at the instant of
         touch.
         """
-        free_motion = self._motion
+        motion_without_touch = self._motion
         first_rows, weights = cubic_weights(positions_m, self._x_m)
-        displacement_m = interpolate_rows(free_motion.displacement_m, first_rows, weights)
+        displacement_m = interpolate_rows(motion_without_touch.displacement_m, first_rows, weights)
         free_motion_m = self._interpolate_to_steps(displacement_m, instants_s, step_count)
         if given_pressing_sign is None:
             position_before_m = shift_rows(
-                displacement_m, (instants_s - free_motion.first_s) / free_motion.step_s - 1.0, 1
+                displacement_m,
+                (instants_s - motion_without_touch.first_s) / motion_without_touch.step_s - 1.0,
+                1,
             )
             pressing_signs = np.where(free_motion_m[:, 0] >= position_before_m[:, 0], 1.0, -1.0)
         else:
@@ -275,9 +286,9 @@ class ObstacleContact:
         self, displacement_m: RealArray, instants_s: RealArray, step_count: int
     ) -> RealArray:
         """Return displacements at the time steps of the contact, each row from its instant on."""
-        free_motion = self._motion
-        begin_steps = (instants_s - free_motion.first_s) / free_motion.step_s
-        substeps = max(1, round(free_motion.step_s / self._kernels.step_s))
+        motion_without_touch = self._motion
+        begin_steps = (instants_s - motion_without_touch.first_s) / motion_without_touch.step_s
+        substeps = max(1, round(motion_without_touch.step_s / self._kernels.step_s))
         interpolated_m = np.empty((begin_steps.size, substeps * -(-step_count // substeps)))
         for i in range(substeps):
             substep_columns = interpolated_m[:, i::substeps]
@@ -460,7 +471,7 @@ class CandidateGrid:
         ]  # (positions, steps, samples)
 
     def integrate(
-        self, free_motion: FreeMotion, sample_window: WhitenedWindow, latest_sample: int
+        self, motion_without_touch: FreeMotion, sample_window: WhitenedWindow, latest_sample: int
     ) -> tuple[RealArray, RealArray]:
         """Return all candidates of the grid (k, 3), and their sums of squared residuals (k,).
 
@@ -469,17 +480,20 @@ class CandidateGrid:
         touch_samples = np.arange(sample_window.first_sample + 1, latest_sample + 1)
         sample_batches = np.array_split(touch_samples, -(-touch_samples.size // _INSTANTS_AT_ONCE))
         chi2 = [
-            self._sums_of_squared_residuals(free_motion, sample_window, sample_batch)
+            self._sums_of_squared_residuals(motion_without_touch, sample_window, sample_batch)
             for sample_batch in sample_batches
         ]
         grid_axes = np.meshgrid(
-            self._x_m, free_motion.t[touch_samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
+            self._x_m,
+            motion_without_touch.t[touch_samples],
+            np.log(GRID_STIFFNESSES_N_PER_M),
+            indexing="ij",
         )
         return np.stack(grid_axes, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
     def _sums_of_squared_residuals(
         self,
-        free_motion: FreeMotion,
+        motion_without_touch: FreeMotion,
         sample_window: WhitenedWindow,
         sample_indices: NDArray[np.intp],
     ) -> RealArray:
@@ -491,11 +505,12 @@ class CandidateGrid:
         sample_count = sample_window.end_sample - int(sample_indices[0])
         time_steps = self._steps_per_sample * sample_count
         begin_steps = np.round(
-            (free_motion.t[sample_indices] - free_motion.first_s) / free_motion.step_s
+            (motion_without_touch.t[sample_indices] - motion_without_touch.first_s)
+            / motion_without_touch.step_s
         ).astype(np.intp)
         step_columns = begin_steps[:, None] + np.arange(-1, time_steps)
-        last_column = free_motion.displacement_m.shape[1] - 1
-        displacement_m = free_motion.displacement_m[:: self._position_stride][
+        last_column = motion_without_touch.displacement_m.shape[1] - 1
+        displacement_m = motion_without_touch.displacement_m[:: self._position_stride][
             :, np.minimum(step_columns, last_column)
         ]
         # Axes: position, instant, step.
@@ -519,12 +534,12 @@ class CandidateGrid:
                 position_count,
                 sample_indices.size,
                 stiffness_count,
-                free_motion.noise_stds.size,
+                motion_without_touch.noise_stds.size,
                 sample_window.end_sample - sample_window.first_sample,
             ),
             dtype=np.float32,
         )
-        for channel_index in range(free_motion.noise_stds.size):
+        for channel_index in range(motion_without_touch.noise_stds.size):
             channel_effect = (
                 forces_n @ self._lag_kernels[channel_index][:, :time_steps, :sample_count]
             )

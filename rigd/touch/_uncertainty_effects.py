@@ -27,31 +27,36 @@ def uncertainty_effects(
     likely obstacle has position, instant and logarithm of the stiffness, shape (1, 3). The window
     begins before the touch.
     """
-    free_motion, quiet_samples = sample_window.motion, sample_window.first_sample
-    finest_effect = ObstacleContact(
-        touch_tables.fine_kernels, touch_tables.x_m, free_motion
+    motion_without_touch, quiet_samples = sample_window.motion, sample_window.first_sample
+    fine_step_effect = ObstacleContact(
+        touch_tables.fine_kernels, touch_tables.x_m, motion_without_touch
     ).predict(likely_obstacle, sample_window)[0][0]
-    obstacle_contact = ObstacleContact(touch_tables.middle_kernels, touch_tables.x_m, free_motion)
-    middle_effect = obstacle_contact.predict(likely_obstacle, sample_window)[0][0]
+    obstacle_contact = ObstacleContact(
+        touch_tables.middle_kernels, touch_tables.x_m, motion_without_touch
+    )
+    middle_step_effect = obstacle_contact.predict(likely_obstacle, sample_window)[0][0]
     effect_list = [
-        finest_effect - middle_effect,
+        fine_step_effect - middle_step_effect,
         *_free_motion_effects(touch_tables, obstacle_contact, likely_obstacle[0], sample_window),
         *_encoder_noise_effects(touch_tables, obstacle_contact, likely_obstacle[0], sample_window),
     ]
     window_slice = slice(sample_window.first_sample, sample_window.end_sample)
-    residuals = free_motion.innovations[:, window_slice] - middle_effect
+    residuals = motion_without_touch.innovations[:, window_slice] - middle_step_effect
     x = float(likely_obstacle[0, 0])
     nearby_positions_m = min(x, touch_tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
     for nearby_beam in touch_tables.changed_beams:
         changed_beam = nearby_beam.at_positions(nearby_positions_m).motion(
-            touch_record, quiet_samples, quiet_samples - 4, free_motion.angle_transform
+            touch_record, quiet_samples, quiet_samples - 4, motion_without_touch.angle_transform
         )
         nearby_kernels = contact_kernels(
             nearby_beam.model.plant.beam,
             nearby_beam.model.plant.damping,
             np.array([x]),
             touch_tables.middle_kernels.step_s,
-            round((free_motion.t[-1] - likely_obstacle[0, 1]) / touch_tables.middle_kernels.step_s)
+            round(
+                (motion_without_touch.t[-1] - likely_obstacle[0, 1])
+                / touch_tables.middle_kernels.step_s
+            )
             + 4,
             nearby_beam.model.sensor_filter,
         )
@@ -74,22 +79,24 @@ def _free_motion_effects(
 
     Each is the sum of the direct effect and the effect through the changed contact force.
     """
-    free_motion = sample_window.motion
-    amplitude_cholesky = free_motion.amplitude_cholesky
-    amplitude_count = free_motion.free_vibration.poles.size * 2
+    motion_without_touch = sample_window.motion
+    amplitude_cholesky = motion_without_touch.amplitude_cholesky
+    amplitude_count = motion_without_touch.free_vibration.poles.size * 2
     position_fraction = likely_obstacle[:1] / touch_tables.model.plant.beam.length_m
-    step_count = free_motion.displacement_m.shape[1]
+    step_count = motion_without_touch.displacement_m.shape[1]
     # Times from the record's beginning, as for the amplitudes.
     t = (
-        free_motion.first_s
+        motion_without_touch.first_s
         + touch_tables.model.angle_delay_s
-        + free_motion.step_s * np.arange(step_count)
+        + motion_without_touch.step_s * np.arange(step_count)
     )
-    displacement_m = free_motion.free_vibration.at_positions(position_fraction).displacement(
-        t, amplitude_cholesky[:amplitude_count]
-    )[0]
+    displacement_m = motion_without_touch.free_vibration.at_positions(
+        position_fraction
+    ).displacement(t, amplitude_cholesky[:amplitude_count])[0]
     direct_effects = (
-        free_motion.design_matrices[:, sample_window.first_sample : sample_window.end_sample]
+        motion_without_touch.design_matrices[
+            :, sample_window.first_sample : sample_window.end_sample
+        ]
         @ amplitude_cholesky
     )
     return direct_effects.transpose(2, 0, 1) + obstacle_contact.effect_of_changed_motion(
@@ -107,14 +114,14 @@ def _encoder_noise_effects(
 
     Each is the effect of the noise in one sample of the angle through the contact force.
     """
-    free_motion = sample_window.motion
+    motion_without_touch = sample_window.motion
     sample_indices = np.arange(sample_window.first_sample, sample_window.end_sample)
     nearest_position_index = int(np.argmin(np.abs(touch_tables.x_m - likely_obstacle[0])))
     sample_displacement = touch_tables.free_beam.displacement_per_sample(
         nearest_position_index, sample_indices.size + 8
     )
     # Columns begin four samples before the window.
-    window_steps = np.arange(free_motion.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE
+    window_steps = np.arange(motion_without_touch.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE
     response_index = (
         window_steps[None, :]
         - STEPS_PER_SAMPLE
@@ -126,5 +133,5 @@ def _encoder_noise_effects(
         0.0,
     )
     return obstacle_contact.effect_of_changed_motion(
-        likely_obstacle, sample_window, free_motion.angle_noise_rad * displacement_m
+        likely_obstacle, sample_window, motion_without_touch.angle_noise_rad * displacement_m
     )

@@ -149,9 +149,9 @@ def blueprint(
     """Return the layout of the live window, which follows the newest sample.
 
     Plots of `absent_components` are omitted, because the session has no values for them.
-    `fitted_mode_count` is the number of modes whose fits are plotted over time, if
-    `with_target_std` with the limits of a requested precision; 0 gives only a table of the last
-    fit, None no tab Fit.
+    `fitted_mode_count` is the number of modes whose fits are plotted over time: with 0, the tab Fit
+    has only a table of the last fit; with None, there is no such tab. `with_target_std` adds the
+    limits of a requested precision to these plots.
     """
     import rerun.blueprint as rrb
 
@@ -429,7 +429,7 @@ _CurvePoint = tuple[int, float]
 
 
 class AxisTickPoints:
-    """Extreme values of a source's plots, from which invisible points for axis labels follow.
+    """Extreme values of a source's plots, and invisible points that give each axis two labels.
 
     Plots of other sources and plots with fixed axes are ignored.
     """
@@ -454,7 +454,7 @@ class AxisTickPoints:
     def tick_drawings(
         self, t_ns: npt.NDArray[np.int64], plot_values: Mapping[str, Values]
     ) -> list[Drawing]:
-        """Return functions that send the invisible points that the axes need for new values.
+        """Return functions that send invisible points, which extend axes until each has two labels.
 
         `plot_values` has the values of each plot at the times `t_ns` (n,): component name → values
         (n, curves). Values that are not finite are ignored, as in Rerun.
@@ -517,7 +517,7 @@ class _AxisExtremes:
     def add(self, t_ns: int, least_value: float, greatest_value: float) -> list[_CurvePoint]:
         """Add the least and greatest value of a time interval, and return new invisible points.
 
-        They are points (time, value) that the axis needs for its labels.
+        A point (time, value) extends the axis until it has two labels.
         """
         if not (math.isfinite(least_value) and math.isfinite(greatest_value)):
             return []

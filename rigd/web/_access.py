@@ -202,7 +202,7 @@ class Connections:
         """Connections of open pages."""
 
     def close_silent_connections(self) -> None:
-        """Close connections that have sent no request in time; repeat that periodically."""
+        """Close connections that have sent no request in time, now and at regular intervals."""
         now_s, open_connections = time.monotonic(), set(self.http_server.connections)
         self._first_request_deadlines = {
             handler: deadline_s
@@ -236,7 +236,10 @@ class Connections:
 
     @web.middleware
     async def register_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Register that a connection has sent a request, and whether it belongs to an open page."""
+        """Return the response to a request, and register that its connection is not silent.
+
+        The connection with the live messages is that of an open page for as long as it lasts.
+        """
         self._first_request_deadlines.pop(request.protocol, None)
         if request.path != LIVE_PATH:
             return await handler(request)

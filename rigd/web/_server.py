@@ -15,7 +15,7 @@ from aiohttp import web
 
 from rigd.beam import Beam, Damping
 from rigd.daemon.client import DaemonUnreachableError, RefusedByDaemonError, stop_session
-from rigd.engine.messages import PageAddress, ProcessFailed
+from rigd.engine.messages import OperatorPageServed, ProcessFailed
 from rigd.engine.processes import SupervisorConnection
 from rigd.excitation import KINDS, excitation_options
 from rigd.profile import specimen_files
@@ -365,7 +365,7 @@ async def _serve_until_end(daemon_connection: SupervisorConnection, page_job: Do
             ProcessFailed(f"port {page_job['port']} cannot be opened: {error.strerror}")
         )
         return
-    daemon_connection.send(PageAddress(port_of(listening_server)))
+    daemon_connection.send(OperatorPageServed(port_of(listening_server)))
     server_task = asyncio.create_task(page_server.run())
     daemon_end = asyncio.get_running_loop().run_in_executor(None, daemon_connection.poll, None)
     await asyncio.wait((server_task, daemon_end), return_when=asyncio.FIRST_COMPLETED)

@@ -12,16 +12,16 @@ from rigd.identification import _records, read_recording
 from rigd.identification.estimate import MotorEstimateError, estimate_motor
 from rigd.identification.experiments import (
     SpeedPass,
-    multisine_session,
+    constant_speeds_excitation,
+    multisine_excitation,
     passes_of_schedule,
     read_schedule,
-    speeds_session,
-    trial_session,
+    trial_excitation,
 )
 from rigd.runner.planning import plan_session
 from rigd.testing import Signals, write_session
 
-SESSIONS = (trial_session, multisine_session, speeds_session)
+SESSIONS = (trial_excitation, multisine_excitation, constant_speeds_excitation)
 
 
 def as_text(excitation):
@@ -58,7 +58,7 @@ def test_speed_has_one_sign_in_every_pass(profile, make):
 
 
 def test_multisine_excites_its_band_uniformly(profile):
-    excitation = multisine_session(profile, torque_percent=60.0, stroke_rad=0.8)
+    excitation = multisine_excitation(profile, torque_percent=60.0, stroke_rad=0.8)
     speed = close_loop(profile.loop_model()).simulate(excitation.reference_rad).velocity_rad_s
     run = passes_of(excitation)[4]
     spectrum = np.abs(np.fft.rfft(speed[run.first_tick : run.end_tick]))
@@ -84,7 +84,8 @@ def test_cycles_are_equal_except_for_a_small_offset(profile, make):
 
 def test_a_smaller_stroke_is_swept_more_slowly(profile):
     wide, narrow = (
-        multisine_session(profile, torque_percent=40.0, stroke_rad=stroke) for stroke in (0.8, 0.2)
+        multisine_excitation(profile, torque_percent=40.0, stroke_rad=stroke)
+        for stroke in (0.8, 0.2)
     )
     assert np.abs(narrow.reference_rad).max() < 0.2
     assert passes_of(narrow)[0].speed_rad_s < 0.4 * passes_of(wide)[0].speed_rad_s
@@ -92,7 +93,7 @@ def test_a_smaller_stroke_is_swept_more_slowly(profile):
 
 def test_half_of_the_speed_limit_remains(profile):
     slow = replace(profile, limits=replace(profile.limits, velocity_rad_s=0.6))
-    excitation = multisine_session(slow, torque_percent=40.0, stroke_rad=0.8)
+    excitation = multisine_excitation(slow, torque_percent=40.0, stroke_rad=0.8)
     assert passes_of(excitation)[0].speed_rad_s == pytest.approx(0.3)
     plan_session(slow, excitation)
 
@@ -117,7 +118,7 @@ def test_bad_options_are_refused(profile, make, options, words):
 
 @pytest.mark.parametrize("change", [{"excitation": "chirp"}, {"cycles": "many"}, {"turn_s": None}])
 def test_other_metadata_hold_no_layout(profile, change):
-    metadata = as_text(multisine_session(profile, torque_percent=40.0, stroke_rad=0.8))
+    metadata = as_text(multisine_excitation(profile, torque_percent=40.0, stroke_rad=0.8))
     assert read_schedule(metadata) is not None
     changed = {k: v for k, v in (metadata | change).items() if v is not None}
     assert read_schedule(changed) is None
@@ -126,8 +127,8 @@ def test_other_metadata_hold_no_layout(profile, change):
 @pytest.mark.parametrize(
     ("make", "end", "words"),
     [
-        (speeds_session, 5000, "Constant speeds alone .* motor-multisine"),
-        (multisine_session, 100, "Too few passes: 0 of 0"),  # stopped before the first
+        (constant_speeds_excitation, 5000, "Constant speeds alone .* motor-multisine"),
+        (multisine_excitation, 100, "Too few passes: 0 of 0"),  # stopped before the first
     ],
 )
 def test_insufficient_sessions_are_reported(profile, tmp_path, make, end, words):

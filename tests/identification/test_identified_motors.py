@@ -17,11 +17,11 @@ from rigd.identification import with_cautious_controller, with_tuned_controller
 from rigd.identification.estimate import PassReadings, Timing, estimate_motor
 from rigd.identification.experiments import (
     HIGHEST_FREQUENCY_HZ,
-    multisine_session,
+    constant_speeds_excitation,
+    multisine_excitation,
     passes_of_schedule,
     read_schedule,
-    speeds_session,
-    trial_session,
+    trial_excitation,
 )
 from rigd.profile import load_profile
 
@@ -140,7 +140,7 @@ def begin(nominal, motor, seed):
         signals = record(prepared, true_rig, motor.torque_scale, excitation)
         return windows_of(excitation, signals, number)
 
-    trial = estimate_motor(run(trial_session, with_cautious_controller(nominal), 0), timing)
+    trial = estimate_motor(run(trial_excitation, with_cautious_controller(nominal), 0), timing)
     return trial, timing, run
 
 
@@ -148,7 +148,7 @@ def identify(nominal, motor, seed):
     """Run the three sessions as the command does, and estimate."""
     trial, timing, run = begin(nominal, motor, seed)
     fitted = with_tuned_controller(nominal, trial)
-    windows = run(multisine_session, fitted, 1) + run(speeds_session, fitted, 2)
+    windows = run(multisine_excitation, fitted, 1) + run(constant_speeds_excitation, fitted, 2)
     return estimate_motor(windows, timing)
 
 

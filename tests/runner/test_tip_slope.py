@@ -9,7 +9,7 @@ from cases import further
 from rigd.beam.tip import SMALL_TIP_SLOPE_RAD, linear_model_error
 from rigd.errors import UserError
 from rigd.excitation import chirp, from_csv, multisine, step
-from rigd.identification.experiments import speeds_session
+from rigd.identification.experiments import constant_speeds_excitation
 from rigd.runner import with_tip_slope
 from rigd.runner.planning import (
     excitation_for,
@@ -88,7 +88,7 @@ def test_moves_and_touches_state_their_slope(profile, kind, options, meaning):
 
 
 def test_motor_identification_is_independent_of_the_model(profile):
-    excitation = speeds_session(profile, torque_percent=40.0, stroke_rad=0.8)
+    excitation = constant_speeds_excitation(profile, torque_percent=40.0, stroke_rad=0.8)
     plan = predict_session(profile, excitation)
     assert plan.prediction.tip.slope_rad > SMALL_TIP_SLOPE_RAD
     assert not plan.refusal_text

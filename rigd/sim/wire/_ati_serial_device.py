@@ -90,7 +90,7 @@ _MAX_FRAME_BYTES = 256
 """Longest Modbus frame in bytes."""
 _STREAM_RECORD_BYTES = 13
 """Size of a record of the stream in bytes."""
-_UNSET_GAUGE_COUNTS = -32768
+_UNCONFIGURED_GAUGE_COUNTS = -32768
 """Reading of a gauge whose gain or offset differs from the calibration."""
 _RECORD_ERROR_BIT = 0x80
 """Error bit in the last byte of a record."""
@@ -150,7 +150,7 @@ class AtiSerialDevice:
             settings, self.gauges, rig.sensor.range
         )
         self._holding_registers = dict(self._power_up_registers)
-        self._unset_gauges = list(range(6))
+        self._unconfigured_gauges = list(range(6))
         """Numbers of the gauges whose gain or offset differs from the calibration."""
         self._incomplete_request = b""
         self._has_received = False
@@ -182,7 +182,7 @@ class AtiSerialDevice:
         """Restart the sensor as by its own watchdog: it stops streaming and loses its set-up."""
         self.streaming = self._unlocked = False
         self._holding_registers = dict(self._power_up_registers)
-        self._unset_gauges = list(range(6))
+        self._unconfigured_gauges = list(range(6))
         self._incomplete_request = b""
         self._bytes_while_streaming = 0
         self._log("sensor", "restart")
@@ -223,10 +223,13 @@ class AtiSerialDevice:
         return list(self._sensor.records)[-self._records_per_period :]
 
     def _read_gauges(self, wrenches: list[Wrench]) -> NDArray[np.int16]:
-        """Return the gauge counts under wrenches; unset gauges read the end of their range."""
+        """Return the gauge counts under wrenches.
+
+        Gauges whose gain or offset differs from the calibration read the end of their range.
+        """
         gauge_counts = self.gauges.read_counts(wrenches, self.saturate)
-        if self._unset_gauges:
-            gauge_counts[:, self._unset_gauges] = _UNSET_GAUGE_COUNTS
+        if self._unconfigured_gauges:
+            gauge_counts[:, self._unconfigured_gauges] = _UNCONFIGURED_GAUGE_COUNTS
         return gauge_counts
 
     def _answer(self, request: bytes) -> None:
@@ -286,7 +289,7 @@ class AtiSerialDevice:
         ):
             return _ILLEGAL_VALUE
         self._holding_registers.update(written_values)
-        self._unset_gauges = [
+        self._unconfigured_gauges = [
             gauge
             for gauge in range(6)
             if self._holding_registers[_GAIN_REGISTERS[gauge]] != _GAUGE_GAINS[gauge]
@@ -307,8 +310,8 @@ class AtiSerialDevice:
         self.streaming = True
         self._bytes_while_streaming = 0
         self._log("sensor", "stream started")
-        if self._unset_gauges:
-            self._log("sensor", "gains and offsets not loaded", gauges=self._unset_gauges)
+        if self._unconfigured_gauges:
+            self._log("sensor", "gains and offsets not loaded", gauges=self._unconfigured_gauges)
         return b"\x01"
 
     def _set_storage_lock(self, request_content: bytes) -> bytes | int:
