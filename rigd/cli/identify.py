@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rigd.identification.estimate import MotorEstimate
     from rigd.profile import Profile
 
-    SessionBuilder = Callable[..., Excitation]
+    ExcitationBuilder = Callable[..., Excitation]
     PrepareProfile = Callable[[Profile], Profile]
 
 identify_app = typer.Typer(
@@ -146,13 +146,13 @@ def _run_sessions(
     from rigd.runtime import ignore_end_signals
 
     def run_numbered_session(
-        session_builder: "SessionBuilder",
+        excitation_builder: "ExcitationBuilder",
         prepare_profile: "PrepareProfile",
         session_number: int,
         process_group: ProcessGroup,
     ) -> Path:
         def build_excitation(profile: "Profile") -> "Excitation":
-            return session_builder(profile, torque_percent=torque_percent, stroke_rad=stroke_rad)
+            return excitation_builder(profile, torque_percent=torque_percent, stroke_rad=stroke_rad)
 
         session_results = run_in_foreground(
             build_excitation,
@@ -191,9 +191,9 @@ def _run_sessions(
 
         return [
             run_numbered_session(
-                session_builder, tune_profile, session_number, ProcessGroup(with_live_view=False)
+                excitation_builder, tune_profile, session_number, ProcessGroup(with_live_view=False)
             )
-            for session_number, session_builder in enumerate(
+            for session_number, excitation_builder in enumerate(
                 (multisine_excitation, constant_speeds_excitation), start=1
             )
         ]
