@@ -51,8 +51,7 @@ case "${0##*/} $*" in
     "rigd run chirp --profile sim --fast "*) set -- "$@" --duration 30 --ring-down 3 ;;
     "rigd run chirp --fast --output sessions "*) set -- "$@" --duration 30 --ring-down 3 ;;
     "rigd run chirp --repeat 20 "*) set -- "$@" --fast --duration 30 --ring-down 3 --repeat 2 ;;
-    "rigd run chirp --amplitude 0.005") set -- "$@" --fast --duration 30 --ring-down 3 ;;
-    "rigd run chirp --amplitude "*) set -- "$@" --fast --duration 30 --ring-down 3 --repeat 2 ;;
+    "rigd run chirp --amplitude "*) set -- "$@" --fast --duration 30 --ring-down 3 ;;
     "rigd run chirp"|"rigd run chirp --there-and-back "*|"rigd run chirp --watch-fit")
         set -- "$@" --fast --duration 30 --ring-down 3 ;;
     "rigd run multisine "*) set -- "$@" --period 2 --duration 6 ;;
