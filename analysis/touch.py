@@ -177,7 +177,7 @@ class TouchAnalysis:
 
     Parameters
     ----------
-    model
+    model_path
         JSON document of ``analyze … --json`` with the beam to assume. With None, the nominal beam
         of the profile attached to each file is used.
     """

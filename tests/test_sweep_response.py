@@ -39,7 +39,7 @@ def final_response(record, samples):
     for first in range(0, len(samples), 50):
         response.feed(samples[first : first + 50])
     found = response.estimate()
-    assert found.final
+    assert found.is_final
     return found.response.band(*PAPER_BAND_HZ)
 
 

@@ -123,7 +123,7 @@ class TorquePredictor:
 
         Parameters
         ----------
-        plant, wrt
+        plant, gradient_parameters
             As for `torque`.
         """
         torque_spectra = self._torque_spectra(plant, gradient_parameters)

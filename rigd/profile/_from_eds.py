@@ -74,7 +74,7 @@ class Draft:
 
     Parameters
     ----------
-    base
+    base_profile
         Profile whose text and values the draft starts from.
     eds
         Content of the drive's EDS file.

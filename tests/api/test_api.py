@@ -58,9 +58,12 @@ def test_load_and_frf_match_the_command(record, workspace):
 
 @pytest.mark.fit
 def test_fit_by_either_method(record):
-    settings = {"fixed": ("delay_s",), "band_hz": (0.0, 30.0)}
-    (found,) = api.fit(record, ["III"], **settings).fits
-    (own,) = fit_record(Measurement.from_record(record), [STRUCTURES["III"]], **settings).fits
+    fixed, band_hz = ("delay_s",), (0.0, 30.0)
+    (found,) = api.fit(record, ["III"], fixed=fixed, band_hz=band_hz).fits
+    measurement = Measurement.from_record(record)
+    (own,) = fit_record(
+        measurement, [STRUCTURES["III"]], fixed_settings=fixed, band_hz=band_hz
+    ).fits
     assert found.parameters == own.parameters
     assert "delay_s" not in found.interval
     paper = api.fit(record, ["I", "III"], method="welch", weightings=["omega"], band_hz=(1.0, 40.0))

@@ -556,8 +556,8 @@ def test_chirp_there_and_back_begins_as_a_plain_chirp(short_chirps, tmp_path):
     assert both.outcome == "complete"
     assert both.metadata["there_and_back"] == "1"
     assert both.time_s.size == 41_500
-    assert (both.there, both.sweep) == (slice(500, 20_500), slice(500, 40_500))
-    assert (plain.there, plain.sweep) == (None, slice(500, 20_500))
+    assert (both.outward_sweep, both.sweep) == (slice(500, 20_500), slice(500, 40_500))
+    assert (plain.outward_sweep, plain.sweep) == (None, slice(500, 20_500))
     np.testing.assert_array_equal(both.torque_nm[:20_500], plain.torque_nm[:20_500])
     settings = welch_settings(both, WelchSettings())
     responses = [estimate(record, settings)[0].response for record in (both, plain)]
@@ -578,7 +578,7 @@ def test_welch_estimate_there_and_back_uses_the_way_there(short_chirps):
     both = record_of(replace(session, segments=planned, metadata={**stated, "there_and_back": "1"}))
     half = {"sweep": (500, 10_500), "ring_down": (10_500, 20_500)}
     plain = record_of(replace(session, segments=half, metadata=stated))
-    assert (both.there, both.sweep) == (slice(500, 10_500), slice(500, 20_500))
+    assert (both.outward_sweep, both.sweep) == (slice(500, 10_500), slice(500, 20_500))
     settings = welch_settings(both, WelchSettings(segment_length=1439, overlap=216))
     responses = [estimate(record, settings)[0].response for record in (both, plain)]
     np.testing.assert_array_equal(*responses)
@@ -594,5 +594,5 @@ def test_welch_estimate_of_a_chirp_stopped_on_its_way_back(
     planned = {"sweep": (500, 40_500), "there": (500, 15_500), "back": (15_500, 30_500)}
     stated = {**session.metadata, "duration_s": "15.0", "there_and_back": "1"}
     record = record_of(replace(session, segments=planned, metadata=stated))
-    assert (record.there, record.sweep) == (slice(500, 15_500), slice(500, 21_500))
+    assert (record.outward_sweep, record.sweep) == (slice(500, 15_500), slice(500, 21_500))
     assert welch_exclusion_reason(record) is None

@@ -111,5 +111,5 @@ def test_state_reasons_name_the_excitation_in_plain_words(fields, words):
     request = parse_request(json.dumps({"command": "start", **fields}).encode())
     series = ServedSeries(1, request)
     assert series.state_after("")[1] == f"{words} is complete"
-    series.stop.request()
+    series.stop_request.request()
     assert series.state_after("")[1] == f"{words} was stopped"

@@ -26,7 +26,7 @@ RECORD = SimpleNamespace(
     torque_extremes=(),
     tip_mass_kg=None,
     axis_tilt_deg=None,
-    there=None,
+    outward_sweep=None,
 )
 
 

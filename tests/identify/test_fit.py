@@ -81,19 +81,19 @@ def test_strong_damping_of_orders_far_from_1(sessions, true_parameters, plant):
 def test_fixed_parameters_stay_and_reduce_other_uncertainties(sessions):
     measurement = sessions("VI").measured(noise_nm=1e-2, seed=7)
     free = fit(measurement, "VI")
-    fixed = fit(measurement, "VI", fixed=SETTINGS)
+    fixed = fit(measurement, "VI", fixed_settings=SETTINGS)
     assert fixed.parameters["density_over_stiffness"] == pytest.approx(LINK.density_over_stiffness)
     assert fixed.parameters["delay_s"] == fixed.parameters["tool_inertia_kg_m2"] == 0
     assert [fixed.std[name] for name in SETTINGS] == [0.0] * 4
     assert fixed.std["zeta"] < 0.5 * free.std["zeta"]
     assert fixed.determined == ("zeta", "alpha", "gamma", "lambda")
-    one = fit(measurement, "VI", fixed=["delay_s"])
+    one = fit(measurement, "VI", fixed_settings=["delay_s"])
     assert one.std["delay_s"] == 0.0 < one.std["bending_stiffness_n_m2"]
 
 
 def test_errors_of_fixed_parameters_appear_as_damping(sessions):
     wrong = sessions("VI", beam=OTHER, delay_s=3e-4).measured()
-    found = fit(wrong, "VI", fixed=["density_over_stiffness"])
+    found = fit(wrong, "VI", fixed_settings=["density_over_stiffness"])
     assert abs(found.parameters["alpha"] - 0.996) > 0.1
 
 
@@ -433,4 +433,4 @@ def test_different_lengths_are_refused(sessions):
 
 def test_unknown_setting_is_refused(sessions):
     with pytest.raises(ValueError, match="'mass'"):
-        fit(sessions("VI").measured(), "III", fixed=["mass"])
+        fit(sessions("VI").measured(), "III", fixed_settings=["mass"])

@@ -79,7 +79,7 @@ def test_torques_are_replaced_after_a_descent(sessions, monkeypatch, most, hopel
         "normal_equations",
         lambda *args, **k: evaluated.append(1) or evaluate(*args, **k),
     )
-    _, found = Objective(comparison, unknowns).minimum(
+    _, found = Objective(comparison, unknowns).find_minimum(
         unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8])),
         np.ones(comparison.frequency_hz.size),
         StepRule.for_unknowns(unknowns, VANISHING_LOSS_FACTOR),

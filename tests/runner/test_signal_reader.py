@@ -65,7 +65,7 @@ def put(channels, ticks, angle_rad=0.0, *, command_nm=0.0, wrench=(0.0,) * 6):
 def test_gauges_without_ticks_between_records(reader, channels):
     channels.shared_state |= {StateField.PHASE: Phase.OFF, StateField.ANGLE_NRAD: -314_000_000}
     (block,) = reader.take(channels)
-    assert block.count == 0
+    assert block.tick_count == 0
     assert {name: values.size for name, values in block.signals.items()} == {
         "angle_rad": 0, "angle_reference_rad": 0, "coupling_torque_nm": 0,
     }  # fmt: skip
@@ -79,7 +79,7 @@ def test_block_has_every_tick_and_nan_for_missed_ones(reader, channels):
     put(channels, range(50))
     put(channels, [52, 53, 55])
     (block,) = reader.take(channels)
-    assert (block.first_tick, block.count, block.last_tick, block.t_ns) == (0, 56, 55, 0)
+    assert (block.first_tick, block.tick_count, block.last_tick, block.t_ns) == (0, 56, 55, 0)
     missed = np.flatnonzero(np.isnan(block.signals["angle_rad"]))
     assert missed.tolist() == [50, 51, 54]
     assert block.signals["coupling_torque_nm"].dtype == np.float32
@@ -91,25 +91,29 @@ def test_ticks_missed_between_two_reads_are_in_the_second(reader, channels):
     reader.take(channels)
     put(channels, range(53, 60))
     (block,) = reader.take(channels)
-    assert (block.first_tick, block.count, block.t_ns) == (50, 10, 50_000_000)
+    assert (block.first_tick, block.tick_count, block.t_ns) == (50, 10, 50_000_000)
     assert np.isnan(block.signals["angle_rad"][:3]).all()
     put(channels, range(9000, 9010))  # far away: a gap
     (block,) = reader.take(channels)
-    assert (block.first_tick, block.count) == (9000, 10)
+    assert (block.first_tick, block.tick_count) == (9000, 10)
 
 
 def test_new_records_and_long_blocks_are_separate_blocks(reader, channels):
     put(channels, [5, 6, 7])
     put(channels, range(3000))
     blocks = reader.take(channels)
-    assert [(block.first_tick, block.count) for block in blocks] == [(5, 3), (0, 2497), (2497, 503)]
+    assert [(block.first_tick, block.tick_count) for block in blocks] == [
+        (5, 3),
+        (0, 2497),
+        (2497, 503),
+    ]
 
 
 def test_no_old_samples_after_a_pause(reader, channels, clock):
     put(channels, range(100))
     clock.now_s += 5.0
     (block,) = reader.take(channels)
-    assert block.count == 0
+    assert block.tick_count == 0
     put(channels, range(100, 110))
     (block,) = reader.take(channels)
     assert block.first_tick == 100
@@ -129,7 +133,7 @@ def test_gauges_have_the_peaks_of_all_ticks(reader, channels, clock):
     assert [block.gauges for block in reader.take(channels)] == [None]
     clock.now_s += 0.05
     (block,) = reader.take(channels)
-    assert (block.count, block.gauges["angle"].value) == (0, 0.4)
+    assert (block.tick_count, block.gauges["angle"].value) == (0, 0.4)
 
 
 def test_gauges_are_peaks_with_their_limits(reader, channels, profile, clock):

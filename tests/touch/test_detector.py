@@ -153,7 +153,7 @@ def test_a_touch_is_detected_within_ten_milliseconds(model, at_m):
 
 def test_detection_with_torque_alone():
     model = observed_beam(BEAM, DAMPING, RATE_HZ, replace(NOISE, shear_n=None))
-    assert model.channels == 1
+    assert model.channel_count == 1
     force = -np.clip((np.arange(3000) - 2000) / 2, 0, 1)
     angle, torque, _ = record(slew_angle(1.0), force_n=force)
     tick, _ = detection(model, (angle, torque, np.zeros(3000)))

@@ -207,10 +207,13 @@ def bus_load(rig: RigParameters) -> BusLoad:
     ValueError
         If the rig has no CAN bus.
 
-    Examples -------- >>> from rigd.devices.canbus import bus_load >>> from rigd.profile import
-    load_profile >>> load = bus_load(load_profile("antenna_can").rig) >>>
-    print(f"{load.frames_per_s:.0f} frames a second, {load.worst_case_load:.0%} of the bus at
-    worst") 6150 frames a second, 60% of the bus at worst
+    Examples
+    --------
+    >>> from rigd.devices.canbus import bus_load
+    >>> from rigd.profile import load_profile
+    >>> load = bus_load(load_profile("antenna_can").rig)
+    >>> print(f"{load.frames_per_s:.0f} frames/s, {load.worst_case_load:.0%} of the bus at worst")
+    6150 frames/s, 60% of the bus at worst
     """
     if rig.can is None:
         raise ValueError("The rig has no CAN bus.")

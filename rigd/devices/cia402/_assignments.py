@@ -72,7 +72,7 @@ def parse_assignment(assignment_text: str) -> Assignment:
     Examples
     --------
     >>> parse_assignment("3001:2 u32 2500")
-    Assignment(index=12289, sub=2, integer_type='u32', value=2500)
+    Assignment(index=12289, subindex=2, integer_type='u32', object_value=2500)
     """
     pattern_match = _ASSIGNMENT_PATTERN.fullmatch(assignment_text.strip())
     if pattern_match is None:
