@@ -333,10 +333,14 @@ class OnlineEstimator:
                 findings = selection.verdict.findings
                 order_verdicts = (selection.verdict.alpha, selection.verdict.lambda_)
                 if any(finding.kind == "air drag" for finding in findings):
+                    # A record that contradicts its file has only one candidate.
                     linear_fit = next(
-                        candidate.fit
-                        for candidate in selection.linear_candidates
-                        if candidate.structure is ORDER_ONE_STRUCTURE
+                        (
+                            candidate.fit
+                            for candidate in selection.linear_candidates
+                            if candidate.structure is ORDER_ONE_STRUCTURE
+                        ),
+                        None,
                     )
             else:
                 headline, findings, analysis = fit_freest_alone(measurement, band_hz)

@@ -11,6 +11,7 @@ from processes import eventually
 
 from analysis.applicability import record_band_hz
 from analysis.identify import Measurement, fit_freest_alone, select
+from analysis.identify.headline import CONTRADICTED_FILE_REASON
 from analysis.online import OnlineEstimate, OnlineEstimator
 from analysis.record import load_record
 from analysis.results import whole_record
@@ -136,6 +137,26 @@ def test_failed_fit_affects_its_own_estimate_only(session, monkeypatch):
     assert estimate.problem.startswith("The record so far cannot be fitted")
     assert "Singular matrix" in estimate.problem
     assert "are too short for the band" in fit.estimate(1000).problem
+
+
+def test_record_that_contradicts_its_file_is_estimated(session, monkeypatch):
+    """Its only candidate has other orders, and drag may be reported with its modes."""
+
+    def select_of_wrong_unit(measurement, **options):
+        selection = select(measurement, **options)
+        assert [finding.kind for finding in selection.verdict.findings] == ["unit"]
+        drag = replace(selection.verdict.findings[0], kind="air drag")
+        verdict = replace(selection.verdict, findings=(*selection.verdict.findings, drag))
+        return replace(selection, verdict=verdict)
+
+    monkeypatch.setattr("analysis.identify.select", select_of_wrong_unit)
+    signals = scan()
+    estimator = fed_with(replace(signals, torque_nm=9 * signals.torque_nm), session)
+    estimate = estimator.estimate(whole=True)
+    assert not estimate.problem
+    assert {mode.damping_ratio.flag for mode in estimate.headline.modes} == {
+        CONTRADICTED_FILE_REASON
+    }
 
 
 def with_mass_at_tip(signals, tip_kg, damping=PAPER_DAMPING):
