@@ -44,7 +44,7 @@ _TWO_SWEEPS_REMARK: Final = (
 )
 """Remark on a session with a sweep in both directions."""
 
-_COMPLETE_SWEEP_FRACTION: Final = 0.99
+COMPLETE_SWEEP_FRACTION: Final = 0.99
 """Fraction of the planned sweep from which it counts as complete, as samples may be missing at the
 end."""
 
@@ -305,7 +305,7 @@ def welch_exclusion_reason(
     if (
         requested_band_hz is not None
         or planned_duration_s is None
-        or swept_duration_s >= _COMPLETE_SWEEP_FRACTION * planned_duration_s
+        or swept_duration_s >= COMPLETE_SWEEP_FRACTION * planned_duration_s
     ):
         return None
     reached_hz = _reached_frequency_hz(record, swept_duration_s / planned_duration_s)

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from analysis.applicability import COMPLETE_SWEEP_FRACTION
 from rigd.session.user_metadata import added_metadata
 from rigd.units import unit_of
 
@@ -75,9 +76,6 @@ _SWEEP_EXCITATION: Final = "chirp"
 """Name of the excitation by a sweep."""
 _SEARCH_EXCITATION: Final = "until"
 """Name of the excitation that is planned while it runs, and so differs in each session."""
-
-_COMPLETE_SWEEP_FRACTION: Final = 0.99
-"""Smallest recorded fraction of a sweep that counts as complete: the last samples may be lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +162,7 @@ class Experiment:
             return ""
         if self.facts.get("there_and_back") == 1.0:
             planned_duration_s *= 2
-        if self.sweep_s >= _COMPLETE_SWEEP_FRACTION * planned_duration_s:
+        if self.sweep_s >= COMPLETE_SWEEP_FRACTION * planned_duration_s:
             return ""
         return (
             f"its sweep ended after {self.sweep_s:.4g} s of {planned_duration_s:g} s (outcome: "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+from analysis.campaigns._orders import MIN_ADEQUATE_FRACTION, UNEXPLAINED_RECORDS_REASON
 from analysis.identify import headline_json
 from analysis.identify.headline import ConditionalEstimate, Estimates, ReportedLossFactor
 from analysis.identify.modal_headline import replace_by_modal_model, uniform_beam_refusal_reason
@@ -23,16 +24,12 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.identify.headline import StructureStatus
 
-_UNEXPLAINED_FLAG: Final = "part of the records is unexplained"
-"""Flag of all estimates if too many sessions have a residual that is not noise."""
 _MIXTURE_FLAG: Final = "the mean of a mixture: sessions differ significantly"
 """Flag of a quantity that differs significantly between sessions."""
 _ON_BOUND_FLAG: Final = "the unweighted mean: at its bound in at least one session"
 """Flag of a parameter that is at a bound in at least one session."""
 _NOT_SHOWN_FLAG: Final = "computed from the model: too few records show this mode"
 """Flag of a mode that too few records show."""
-_MIN_ADEQUATE_FRACTION: Final = 0.9
-"""Smallest fraction of sessions with a residual of mere noise at which estimates get no flag."""
 
 
 def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
@@ -142,8 +139,8 @@ def _exact_orders(verdict: CampaignVerdict) -> tuple[PooledOrder, ...]:
 
 def _flag_of_all_values(verdict: CampaignVerdict) -> str | None:
     """Return the flag of all estimates, or None if the residual of enough sessions is noise."""
-    are_records_explained = verdict.adequate >= _MIN_ADEQUATE_FRACTION * verdict.sessions
-    return None if are_records_explained else _UNEXPLAINED_FLAG
+    are_records_explained = verdict.adequate >= MIN_ADEQUATE_FRACTION * verdict.sessions
+    return None if are_records_explained else UNEXPLAINED_RECORDS_REASON
 
 
 def _add_flags(

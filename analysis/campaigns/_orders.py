@@ -26,10 +26,11 @@ if TYPE_CHECKING:
 PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 """Result of the test whether an order is 1 (see `PooledOrder`)."""
 
-_UNEXPLAINED_REASON: Final = "part of the records is unexplained"
-"""Reason for doubt in an order if too many sessions have a residual that is not noise."""
-_MIN_ADEQUATE_FRACTION: Final = 0.9
-"""Smallest fraction of sessions with a residual of mere noise at which an order is reported."""
+UNEXPLAINED_RECORDS_REASON: Final = "part of the records is unexplained"
+"""Reason for doubt, and flag, if too many sessions have a residual that is not noise."""
+MIN_ADEQUATE_FRACTION: Final = 0.9
+"""Smallest fraction of sessions with a residual of mere noise at which orders are reported and
+estimates get no flag."""
 
 _EXCLUSION_CONFIDENCE: Final = 0.999
 """Confidence level at which an order of 1 is excluded: one false exclusion in 1000 campaigns."""
@@ -163,14 +164,14 @@ def pooled_order_with_tolerance(
     if exact_order.mixture and exact_order.reason is not None:
         return replace(tolerant_order.with_doubt(exact_order.reason), mixture=True)
     if not _nearly_all_adequate(verdicts):
-        return tolerant_order.with_doubt(_UNEXPLAINED_REASON)
+        return tolerant_order.with_doubt(UNEXPLAINED_RECORDS_REASON)
     final_reason = effective_reason(estimate, order, refused=is_beam_refused)
     return tolerant_order if final_reason is None else tolerant_order.with_doubt(final_reason)
 
 
 def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:
     """Return whether the residual is noise in at least 90 % of the sessions."""
-    return sum(verdict.adequate for verdict in verdicts) >= _MIN_ADEQUATE_FRACTION * len(verdicts)
+    return sum(verdict.adequate for verdict in verdicts) >= MIN_ADEQUATE_FRACTION * len(verdicts)
 
 
 def rival_estimates(
@@ -220,7 +221,7 @@ def _status_and_reason(
     ):
         return "not identifiable", "the sessions do not determine the order"
     if not _nearly_all_adequate(verdicts):
-        return "open", _UNEXPLAINED_REASON
+        return "open", UNEXPLAINED_RECORDS_REASON
     rivals_with_order_one = [
         estimate
         for estimate in (ranked_estimates[0], *rival_estimates(ranked_estimates, BIC_DECISIVE))

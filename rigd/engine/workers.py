@@ -6,7 +6,7 @@ analyser are named only here, because rigd does not import them.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 from rigd.engine._control_names import CONTROL_MODULE
 from rigd.engine.shared_state import StateField
@@ -47,8 +47,6 @@ class Worker:
     sent_messages: tuple[str, ...] = ()
     """Class names of the messages that the process sends; the first one means that it is ready.
     Empty for a program, whose results are files and an exit code."""
-    loss_severity: Literal["fault", "warning", "nothing"]
-    """How a dead or hung process is reported to the operator: fault, warning, or not at all."""
     consequence: str
     """Sentence for the operator that states what happens after the loss of the process."""
     restarts: int = 0
@@ -87,7 +85,6 @@ CONTROL: Final = Worker(
         "MeasurementRefused",
         "ControlEnded",
     ),
-    loss_severity="fault",
     consequence="The drive's watchdog switches it off; the session ends as a fault.",
     beat=StateField.CONTROL_BEAT,
     max_silence_s=3.0,
@@ -97,7 +94,6 @@ RECORDER: Final = Worker(
     name="recorder",
     module="rigd.engine.recorder",
     sent_messages=("FileOpened", "RecorderReady", "FileClosed", "ProcessFailed"),
-    loss_severity="fault",
     consequence="The session ends as a fault.",
     beat=StateField.RECORDER_BEAT,
     # A disk may stall for seconds; the number of waiting samples is checked instead.
@@ -109,7 +105,6 @@ LIVE: Final = Worker(
     name="live",
     module="rigd.live.publisher",
     sent_messages=("LiveAddress", "LiveSessionShown", "ProcessFailed"),
-    loss_severity="warning",
     consequence="It is not restarted; the session continues.",
     restarts=3,
     beat=StateField.LIVE_BEAT,
@@ -121,7 +116,6 @@ TOUCH: Final = Worker(
     name="touch",
     module="rigd.engine.touch_estimator",
     sent_messages=("TouchReady", "TouchReport"),
-    loss_severity="warning",
     consequence="Touches are detected but not estimated; the session continues.",
     beat=StateField.TOUCH_BEAT,
     start_timeout_s=60.0,  # it computes the responses of the beam first
@@ -134,7 +128,6 @@ FIT: Final = Worker(
     name="fit",
     module="rigd.runner.fit_process",
     sent_messages=("FitReady", "FitReport", "PlannedSegment", "SearchEnded", "ProcessFailed"),
-    loss_severity="warning",
     # A session that plans itself ends with what is planned instead.
     consequence="The session continues without fits.",
     beat=StateField.FIT_BEAT,
@@ -148,7 +141,6 @@ FIT: Final = Worker(
 SUPERVISOR: Final = Worker(
     name="supervisor",
     module="",
-    loss_severity="fault",
     consequence="The control process ends the session as a fault.",
     beat=StateField.SUPERVISOR_BEAT,
     max_silence_s=2.0,
@@ -166,7 +158,6 @@ PAGE: Final = Worker(
     name="page",
     module="rigd.web",
     sent_messages=("OperatorPageServed", "ProcessFailed"),
-    loss_severity="warning",
     consequence="It is not started again; the rig does not need it.",
     restarts=4,
     end_timeout_s=3.0,
@@ -175,7 +166,6 @@ PREDICTION: Final = Worker(
     name="prediction",
     module="rigd.daemon.background",
     sent_messages=("JobPerformed",),
-    loss_severity="nothing",
     consequence="The client's request is refused.",
     end_timeout_s=0.0,
     niceness=19,  # it may run during a session
@@ -189,7 +179,6 @@ PLAN: Final = Worker(
     name="plan",
     module=PREDICTION.module,
     sent_messages=PREDICTION.sent_messages,
-    loss_severity="nothing",
     consequence="The session is not started.",
     end_timeout_s=0.0,
     memory=PREDICTION.memory,
@@ -206,7 +195,6 @@ ONLINE_ESTIMATOR: Final = "analysis.online:OnlineEstimator"
 QUICK_LOOK: Final = Worker(
     name="quick look",
     module="analysis.quick_look",
-    loss_severity="warning",
     consequence="The session has no quick look.",
     end_timeout_s=0.5,
     # Not the lowest priority, because other programs may never pause.
@@ -217,7 +205,6 @@ QUICK_LOOK: Final = Worker(
 REPORT: Final = Worker(
     name="report",
     module="analysis",
-    loss_severity="warning",
     consequence="The report, campaign or export is not made.",
     end_timeout_s=5.0,
     niceness=None,
