@@ -40,7 +40,7 @@ class DoubleWell(OrderProfiler):
         at = NormalEquations(cost(order), np.zeros(1), np.array([[1 / WIDTH**2]]))
         return SimpleNamespace(x=np.array([order]), cost=at.cost, equations=at)
 
-    def _tangent(self, value, near):
+    def _extrapolated_unknowns(self, value, near):
         return np.array([value])
 
 
@@ -102,7 +102,7 @@ def test_failed_descent_does_not_exclude_an_order():
 class TangentAstray(DoubleWell):
     """The same, where only the tangent leads astray."""
 
-    def _tangent(self, value, near):
+    def _extrapolated_unknowns(self, value, near):
         return np.array([value + 8.0])
 
     @property

@@ -93,15 +93,15 @@ def test_the_page_shows_the_steps_of_the_document_to_reset_a_fault():
     page = " ".join((ROOT / "rigd" / "web" / "static" / "index.html").read_text("utf-8").split())
     shown_list = page[page.index('<p id="fault-reason">') :].partition("</ol>")[0]
     shown = re.findall(r"<li>(.*?)</li>", shown_list)
-    section = TEXT[TEXT.index("## How to reset") :].partition("\n\n`rigd reset`")[0]
+    section = TEXT[TEXT.index("## How to reset") :].partition("\n\nA drive that")[0]
     stated = [" ".join(step.split()) for step in re.split(r"\n\d\. ", section)[1:]]
     assert len(shown) == len(stated)
     zone = re.search(r"The danger zone is [^.]+\d\.\d m\.", page).group()
     assert zone[1:] in " ".join(TEXT.replace("**", "").split())
     # Before the reset nothing depends on the program that the operator uses.
-    before_reset = 3
+    before_reset = 4
     assert shown[:before_reset] == stated[:before_reset]
     for words, step in zip(
-        ("<b>Reset</b>", "<b>Zero</b>", "<b>Check</b>"), shown[before_reset:], strict=True
+        ("<b>Reset</b>", "<b>Zero</b>", "rigd check"), shown[before_reset:], strict=True
     ):
         assert words in step
