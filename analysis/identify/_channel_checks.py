@@ -22,8 +22,6 @@ from rigd.beam import Damping, transfer
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import NDArray
-
     from analysis.identify._comparison import Comparison
     from analysis.identify._data import Measurement
 
@@ -182,8 +180,13 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
             ),
         )
     expected_rms = np.sqrt(expected_power)
-    median_magnitude = _weighted_median(
-        ratio_magnitude, np.minimum(expected_rms, np.median(expected_rms))
+    median_magnitude = float(
+        np.quantile(
+            ratio_magnitude,
+            0.5,
+            method="inverted_cdf",
+            weights=np.minimum(expected_rms, np.median(expected_rms)),
+        )
     )
     if not median_magnitude > 0 or abs(math.log(median_magnitude)) < _MIN_LOG_UNIT_FACTOR:
         return
@@ -212,10 +215,3 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
         value=median_magnitude,
         remedy="Check the units of angle and torque, and import the record again.",
     )
-
-
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Return the smallest value up to which the values have half of the total weight."""
-    order = np.argsort(values)
-    cumulative_weights = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(cumulative_weights, cumulative_weights[-1] / 2)])

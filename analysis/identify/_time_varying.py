@@ -443,23 +443,19 @@ def torque_change_by_past_values(
         _TRANSFORM_PADDING_RATIO,
         _TRANSFORM_DECAY_EXPONENT,
     )
-    laplace_variable = transform.s
+    s = transform.s
     retained_samples = comparison.retained_samples
-    change_over_time = np.interp(
+    w = np.interp(
         np.arange(sample_count),
         np.arange(retained_samples.start, retained_samples.stop),
         relative_change,
     )
     damping, beam = plant.damping, plant.beam
-    internal_damping = damping.zeta * laplace_variable**damping.alpha
-    external_damping = damping.gamma * laplace_variable**damping.lambda_
-    inertial_term = (
-        beam.density_over_stiffness * laplace_variable * laplace_variable + external_damping
-    )
+    internal_damping = damping.zeta * s**damping.alpha
+    external_damping = damping.gamma * s**damping.lambda_
+    inertial_term = beam.density_over_stiffness * s * s + external_damping
     changing_factor = internal_damping + 1 if changing_property == "stiffness" else internal_damping
-    angle_transform = transform.forward(comparison.angle_rad) * plant.channel_response(
-        laplace_variable
-    )
+    angle_transform = transform.forward(comparison.angle_rad) * plant.channel_response(s)
     total_torque = np.zeros(sample_count)
 
     def to_time_series(laplace_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -468,7 +464,7 @@ def torque_change_by_past_values(
 
     def multiply_by_change(laplace_transform: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the transform of w times a quantity, from the transform of the quantity."""
-        return transform.forward(change_over_time * to_time_series(laplace_transform))
+        return transform.forward(w * to_time_series(laplace_transform))
 
     k4_of_modes = (eigenvalues(comparison.visible_mode_count) / beam.length_m) ** 4
     modal_stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * k4_of_modes)
@@ -493,12 +489,12 @@ def torque_change_by_past_values(
             ):
                 break
         modal_deflection = (1 - rigid_response) * angle_transform + change_size * vibration_change
-        torque_part = to_time_series(
-            inertial_term * vibration_change
-        ) + change_over_time * to_time_series(external_damping * modal_deflection)
+        torque_part = to_time_series(inertial_term * vibration_change) + w * to_time_series(
+            external_damping * modal_deflection
+        )
         total_torque += modal_stiffness * (
             torque_part
-            - change_over_time
+            - w
             * to_time_series(
                 external_damping * (1 - rigid_response) * angle_transform
                 - rigid_response * constant_stress

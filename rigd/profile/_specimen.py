@@ -149,9 +149,10 @@ def with_specimen(profile: Profile, specimen_name: str) -> Profile:
         If the specimen's file cannot be used.
     """
     paths_by_name = specimen_files()
-    specimen_path = paths_by_name.get(specimen_name.strip())
+    specimen_name = specimen_name.strip()
+    specimen_path = paths_by_name.get(specimen_name)
     if specimen_path is None:
-        similar_names = difflib.get_close_matches(specimen_name.strip(), paths_by_name)
+        similar_names = difflib.get_close_matches(specimen_name, paths_by_name)
         return replace(
             profile, specimen_in_words=_describe_missing_file(specimen_name, similar_names)
         )
@@ -173,7 +174,7 @@ def _describe_missing_file(specimen_name: str, similar_names: Sequence[str]) -> 
     if not similar_names:
         return ""
     return (
-        f"Specimen {specimen_name.strip()!r} has no file: the beam is that of the profile. "
+        f"Specimen {specimen_name!r} has no file: the beam is that of the profile. "
         f"Specimens with a similar name: {', '.join(map(repr, similar_names))}."
     )
 
