@@ -105,10 +105,8 @@ def check_record_band(record: Record, requested_band_hz: FrequencyBand | None) -
     if requested_band_hz is not None and requested_band_hz[1] > limit_hz:
         raise SettingsError(
             f"{record.path}: the band reaches {requested_band_hz[1]:g} Hz, but whole-record fits "
-            "end at "
-            f"{limit_hz:g} Hz, {MAX_FREQUENCY_TO_RATE_RATIO:g} of the rate of {record.rate_hz:g} "
-            "Hz; "
-            "lower --band."
+            f"end at {limit_hz:g} Hz, {MAX_FREQUENCY_TO_RATE_RATIO:g} of the rate of "
+            f"{record.rate_hz:g} Hz; lower --band."
         )
 
 
@@ -141,9 +139,8 @@ def check_excited_band(record: Record, requested_band_hz: FrequencyBand | None) 
     if requested_band_hz[1] > _EXCITED_BAND_MARGIN_FACTOR * excited_hz[1]:
         raise MeasurementError(
             f"{record.path}: the band reaches {requested_band_hz[1]:g} Hz, but the excitation "
-            "covers "
-            f"{excited_hz[0]:.4g} to {excited_hz[1]:.4g} Hz, and beyond there is noise alone; "
-            f"whole-record fits need a --band that ends at {excited_hz[1]:.4g} Hz or lower."
+            f"covers {excited_hz[0]:.4g} to {excited_hz[1]:.4g} Hz, and beyond there is noise "
+            f"alone; whole-record fits need a --band that ends at {excited_hz[1]:.4g} Hz or lower."
         )
 
 

@@ -379,13 +379,10 @@ def check_clock(
         first_not_increasing_index = int(not_increasing_indices[0])
         raise RecordError(
             f"{path}: the time stamp t_ns goes from {t_ns[first_not_increasing_index]} ns at tick "
-            f"{ticks[first_not_increasing_index]} to "
-            f"{t_ns[first_not_increasing_index + 1]} ns at tick "
-            f"{ticks[first_not_increasing_index + 1]}, but time must "
-            "go forward; it does "
-            f"not at {not_increasing_indices.size} of {len(ticks)} samples. Correct the program "
-            "that wrote "
-            "the file."
+            f"{ticks[first_not_increasing_index]} to {t_ns[first_not_increasing_index + 1]} ns at "
+            f"tick {ticks[first_not_increasing_index + 1]}, but time must go forward; it does not "
+            f"at {not_increasing_indices.size} of {len(ticks)} samples. Correct the program that "
+            "wrote the file."
         )
     elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)
     rate_of_stamps_hz = 1e9 * int(ticks[-1] - ticks[0]) / elapsed_ns
@@ -429,10 +426,9 @@ def check_finite(
     if too_large_indices.size:
         raise RecordError(
             f"{path}: {field_name} is {field_values[too_large_indices[0]]:g} at tick "
-            f"{ticks[too_large_indices[0]]} and beyond "
-            f"±{MAX_ABSOLUTE_VALUE:g} in {too_large_indices.size} of {len(field_values)} samples; "
-            "no rig "
-            "has such values; correct the program that wrote the file."
+            f"{ticks[too_large_indices[0]]} and beyond ±{MAX_ABSOLUTE_VALUE:g} in "
+            f"{too_large_indices.size} of {len(field_values)} samples; no rig has such values; "
+            "correct the program that wrote the file."
         )
 
 
@@ -487,9 +483,8 @@ def check_fillable(
     if gap_ticks > MAX_GAP_S * rate_hz:
         raise RecordError(
             f"{path}: {gap_ticks} ticks of the {channel_name} in a row are missing or stale from "
-            "tick "
-            f"{first_tick + gap_start} on ({1e3 * gap_ticks / rate_hz:.0f} ms), longer than the "
-            f"{1e3 * MAX_GAP_S:g} ms that are interpolated; record the session again."
+            f"tick {first_tick + gap_start} on ({1e3 * gap_ticks / rate_hz:.0f} ms), longer than "
+            f"the {1e3 * MAX_GAP_S:g} ms that are interpolated; record the session again."
         )
 
 

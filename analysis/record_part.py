@@ -116,8 +116,7 @@ def check_part_length(path: object, part_s: tuple[float, float], beam: Beam) -> 
         raise RecordError(
             f"{path}: the part from {part_s[0]:g} to {part_s[1]:g} s is too short for an estimate, "
             f"which needs {_MIN_PART_PERIODS:g} periods of the first mode, {min_part_s:.3g} s; "
-            "choose "
-            "a longer part."
+            "choose a longer part."
         )
 
 

@@ -74,8 +74,7 @@ def _check_damping(structure: Structure, parameter_values: Mapping[str, float]) 
         if gain_indices.size:
             raise ValueError(
                 f"its {name} gains energy at {_CHECKED_OMEGA_RAD_S[gain_indices[0]]:.3g} rad/s "
-                "with "
-                f"{parameters_text(parameter_values)}: the imaginary part is negative."
+                f"with {parameters_text(parameter_values)}: the imaginary part is negative."
             )
     conjugate_factors = structure.finite_factors(s.conj(), parameter_values)
     for factor, at_conjugate in zip(factors, conjugate_factors, strict=True):

@@ -80,8 +80,7 @@ def describe_loss_slope(pooled_order: PooledOrder, modal_model: PooledModalModel
     if pooled_order.value is None or pooled_order.interval is None:
         return (
             f"The slope of the {LOSS_NAMES[pooled_order.order]} ({pooled_order.order}) is not "
-            "identifiable: "
-            f"{pooled_order.reason}. {sessions_sentence}"
+            f"identifiable: {pooled_order.reason}. {sessions_sentence}"
         )
     mode_frequencies_hz = [mode.frequency_hz for mode in modal_model.modes]
     slope_sentence = loss_slope_sentence(
@@ -164,8 +163,7 @@ def describe_sweeps(sweeps: OppositeSweeps | None) -> list[str]:
     changes_text = "; ".join(map(_describe_mode_change, sweeps.changed))
     return [
         f"Something changes along the records, or with the direction of the sweep: {sweeps_text} "
-        "differ "
-        f"in {changes_text}. Each mode is as it was when the sweep passed it."
+        f"differ in {changes_text}. Each mode is as it was when the sweep passed it."
     ]
 
 
@@ -206,7 +204,6 @@ def recommend_sweeps(
         missing_direction = "falling" if True in sweep_directions else "rising"
         return [
             f"Add {missing_direction} sweeps (start_hz and stop_hz exchanged): in sweeps of one "
-            "direction a "
-            "change along the record looks like a beam that is not uniform."
+            "direction a change along the record looks like a beam that is not uniform."
         ]
     return []

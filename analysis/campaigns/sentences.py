@@ -262,8 +262,7 @@ def describe_noise_sessions(adequate_session_count: int, session_count: int) -> 
         return "The residual is noise in every session: the model suffices for these records."
     return (
         f"The residual is noise in {adequate_session_count} of {session_count} sessions; in the "
-        "others "
-        "something is unexplained."
+        "others something is unexplained."
     )
 
 
@@ -429,10 +428,8 @@ def describe_dissent(
     ]
     return [
         f"Type {lowest_bic_estimate.name} is excluded by {len(dissenting_sessions)} single "
-        f"session{'s' if len(dissenting_sessions) > 1 else ''}: "
-        f"{join_first_texts(session_texts)}. Check their reports (analyze --each) before relying "
-        "on the "
-        "mean."
+        f"session{'s' if len(dissenting_sessions) > 1 else ''}: {join_first_texts(session_texts)}. "
+        "Check their reports (analyze --each) before relying on the mean."
     ]
 
 
@@ -463,9 +460,8 @@ def describe_scatter(pooled_estimate: PooledEstimate) -> str:
         )
     return (
         f"Between-session variance in {', '.join(varying_labels)} (Cochran's Q): something changes "
-        "between "
-        "sessions, such as clamp, temperature or motor, and the interval of a single session is "
-        "too narrow for the specimen."
+        "between sessions, such as clamp, temperature or motor, and the interval of a single "
+        "session is too narrow for the specimen."
     )
 
 

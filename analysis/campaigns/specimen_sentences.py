@@ -73,10 +73,8 @@ def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]
     )
     return [
         f"The files state {len(specimens)} different specimens: {specimen_texts}. Specimens are "
-        "never "
-        f"pooled: all results below are for {first_specimen}. Analyse the files of the others "
-        "separately, "
-        "or correct the metadata where they are wrong."
+        f"never pooled: all results below are for {first_specimen}. Analyse the files of the "
+        "others separately, or correct the metadata where they are wrong."
     ]
 
 
@@ -116,8 +114,7 @@ def _small_scatter_remark(homogeneity: Homogeneity) -> str:
         return ""
     return (
         f" Frequencies vary by less than {100 * _SLIGHT_FREQUENCY_SCATTER:g} %, as those of one "
-        "beam may when its "
-        "temperature or clamp changes."
+        "beam may when its temperature or clamp changes."
     )
 
 

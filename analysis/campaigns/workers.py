@@ -329,9 +329,8 @@ def dask_cluster(scheduler_address: str) -> Iterator[Workers]:
         except (OSError, ValueError) as error:
             raise CampaignError(
                 f"No Dask scheduler answers at {scheduler_address} within "
-                f"{_CONNECTION_TIMEOUT_S:g} s; start "
-                "one with "
-                "'dask scheduler' and its workers with 'dask worker ADDRESS', or leave --dask out."
+                f"{_CONNECTION_TIMEOUT_S:g} s; start one with 'dask scheduler' and its workers "
+                "with 'dask worker ADDRESS', or leave --dask out."
             ) from error
         try:
             _check_workers(dask_client, scheduler_address)
@@ -422,8 +421,7 @@ class _DaskWorkers(Workers):
         """Return the message of an error that concerns the whole cluster."""
         return (
             f"The Dask scheduler at {self._address} {loss_phrase}; check its log and the workers', "
-            "and "
-            "start the campaign again, or leave --dask out."
+            "and start the campaign again, or leave --dask out."
         )
 
 
@@ -472,7 +470,5 @@ def _check_workers(client: Any, scheduler_address: str) -> None:  # noqa: ANN401
         if version_differences:
             raise CampaignError(
                 f"The Dask worker at {worker} has {', '.join(version_differences)}: install the "
-                "versions "
-                "of this "
-                "machine there, and start it again."
+                "versions of this machine there, and start it again."
             )

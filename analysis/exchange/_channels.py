@@ -331,9 +331,8 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
         raise ExchangeError(
             f"{path}: the times '{channel}' advance unevenly, by {steps_s.min():.6g} to "
             f"{steps_s.max():.6g} s: {100 * gap_fraction:.2g} % of the steps would be gaps. Write "
-            "the "
-            "times with more digits, resample the record to one rate, or give --rate-hz instead of "
-            "--time if the samples are equidistant."
+            "the times with more digits, resample the record to one rate, or give --rate-hz "
+            "instead of --time if the samples are equidistant."
         )
     ticks = np.concatenate(([0.0], np.cumsum(tick_steps)))
     if ticks[-1] + 1 > MAX_TICKS_PER_SAMPLE * len(ticks):

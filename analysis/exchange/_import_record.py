@@ -173,15 +173,13 @@ def _check_duration(path: Path, plan: ImportPlan, timebase: Timebase) -> list[st
     if first_hz >= timebase.rate_hz / 2:
         raise ExchangeError(
             f"{path}: the record lasts {duration_s:.6g} s at {timebase.rate_hz:g} Hz, but the "
-            "first "
-            f"mode of this beam is at {first_hz:.3g} Hz, beyond the Nyquist frequency of "
+            f"first mode of this beam is at {first_hz:.3g} Hz, beyond the Nyquist frequency of "
             f"{timebase.rate_hz / 2:g} Hz; {unit_remedy}, or correct the beam in --profile."
         )
     if duration_s * first_hz < 1:
         return [
             f"The record lasts {duration_s:.3g} s at {timebase.rate_hz:g} Hz, less than one period "
-            "of "
-            f"the first mode of this beam, {first_hz:.3g} Hz; if that is wrong, {unit_remedy}."
+            f"of the first mode of this beam, {first_hz:.3g} Hz; if that is wrong, {unit_remedy}."
         ]
     return []
 

@@ -214,8 +214,7 @@ def _find_variable_value(path: Path, channel_name: str, variables: Mapping[str, 
                 shape_text = "×".join(map(str, found_value.shape))
                 raise ExchangeError(
                     f"{path}: '{parent_name}' is a struct array of {shape_text}, not one struct; "
-                    "name one of "
-                    f"its elements, such as {parent_name}(1).{member_name}, or save "
+                    f"name one of its elements, such as {parent_name}(1).{member_name}, or save "
                     f"[{parent_name}.{member_name}] as a vector."
                 )
             if member_name not in dtype.names:
@@ -383,8 +382,8 @@ def _read_hdf5_vector(path: Path, hdf5_file: Any, channel_name: str, h5py: Any) 
     ):
         raise ExchangeError(
             f"{path}: '{channel_name}' holds no numbers but is of MATLAB's class {matlab_class}, a "
-            "struct array or "
-            "empty; save the values of one record as vectors, such as angle = log(1).angle."
+            "struct array or empty; save the values of one record as vectors, such as angle = "
+            "log(1).angle."
         )
     # HDF5 stores dimensions in the reverse order, so that MATLAB's columns are its rows.
     return _vector_of_array(path, channel_name, dataset[()].T, column_index)

@@ -203,8 +203,8 @@ def read_source(
     except MemoryError as error:
         raise ExchangeError(
             f"{path}: would take more than {MAX_MEMORY_BYTES / _MEGABYTE:.0f} MB of memory to "
-            "read, so it is "
-            "damaged or holds far more than a session; export the session's channels alone."
+            "read, so it is damaged or holds far more than a session; export the session's "
+            "channels alone."
         ) from error
     for channel_name, channel in channels.items():
         sample_count = len(channel.values)
@@ -328,9 +328,8 @@ def check_sample_count(path: Path, channel_text: str, sample_count: int) -> None
     """Raise if a channel has, or claims to have, more than `MAX_SAMPLES` samples."""
     if sample_count > MAX_SAMPLES:
         raise ExchangeError(
-            f"{path}: {channel_text} has {sample_count} samples, more than the {MAX_SAMPLES} "
-            "that are read; cut "
-            "the session out of the file first."
+            f"{path}: {channel_text} has {sample_count} samples, more than the {MAX_SAMPLES} that "
+            "are read; cut the session out of the file first."
         )
 
 

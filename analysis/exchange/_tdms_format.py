@@ -117,8 +117,7 @@ def _check_listed_channel_count(path: Path, stream: BinaryIO) -> None:
     stream.seek(0)
     if listed_count > _MAX_LISTED_CHANNELS:
         raise ExchangeError(
-            f"{path}: its segments list more than {_MAX_LISTED_CHANNELS} channels in all, so it "
-            "is "
+            f"{path}: its segments list more than {_MAX_LISTED_CHANNELS} channels in all, so it is "
             "damaged or no record of a few channels; export the session's channels alone."
         )
 

@@ -210,8 +210,7 @@ def _check_function_of_time(
     if contradiction:
         raise ExchangeError(
             f"{path}: '{channel_name}' is not a function of time: {contradiction}. A session is "
-            "made of measured "
-            "samples: give angle and torque over time."
+            "made of measured samples: give angle and torque over time."
         )
 
 

@@ -149,8 +149,7 @@ class Comparison:
             raise MeasurementError(
                 f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
                 f"or beyond {MAX_FREQUENCY_TO_RATE_RATIO:g} of the sampling rate "
-                f"({band_limit_hz:g} "
-                "Hz); choose another --band."
+                f"({band_limit_hz:g} Hz); choose another --band."
             )
         measurement.check_channels(highest_hz)
         decimation = Decimation.to_band(measurement.rate_hz, highest_hz)

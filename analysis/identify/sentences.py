@@ -268,9 +268,8 @@ def _conditional_sentence(simpler: ConditionalEstimate) -> str:
         if parameter_name in simpler.parameters
     ]
     return (
-        f"{condition[0].upper()}{condition[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} "
-        "not excluded; "
-        f"if true (type {simpler.name}): {', '.join(number_texts)}."
+        f"{condition[0].upper()}{condition[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} not "
+        f"excluded; if true (type {simpler.name}): {', '.join(number_texts)}."
     )
 
 
@@ -306,8 +305,7 @@ def _unidentifiable_reason(order_verdict: OrderVerdict) -> str:
         )
         return (
             f"{minima_text} fit the record equally well, each with a different damping (95 %: "
-            f"{lower_end:.3f} "
-            f"to {upper_end:.3f}, with all that lies between)"
+            f"{lower_end:.3f} to {upper_end:.3f}, with all that lies between)"
         )
     return (
         "any value between 0 and 2 fits"
@@ -366,9 +364,8 @@ def experiments(
             )
         else:
             advice_sentences.append(
-                f"To determine {order_names}, run narrow, slow sweeps around the modes, or a "
-                "wider sweep "
-                "that reaches one more mode."
+                f"To determine {order_names}, run narrow, slow sweeps around the modes, or a wider "
+                "sweep that reaches one more mode."
             )
     has_unexplained_residual = any(finding.kind == "unexplained" for finding in findings)
     if close_rivals or (
@@ -397,8 +394,8 @@ def _advice_for_two_modes(candidate_set: CandidateSet, visible_numbers: tuple[in
     if expected_hz[missing_mode] > last_hz:
         return (
             f"analyse and excite the {_MODE_ORDINALS[missing_mode]} mode as well: band and sweep "
-            "up to at "
-            f"least {1.3 * expected_hz[missing_mode]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
+            f"up to at least {1.3 * expected_hz[missing_mode]:.0f} Hz (the band ends at "
+            f"{last_hz:.0f} Hz)."
         )
     if not is_excited(
         candidate_set.comparison, expected_hz[missing_mode], compared_hz=expected_hz[other_mode]
@@ -411,6 +408,5 @@ def _advice_for_two_modes(candidate_set: CandidateSet, visible_numbers: tuple[in
     return (
         f"raise the {_MODE_ORDINALS[missing_mode]} mode above the noise: it was driven at its "
         f"{expected_hz[missing_mode]:.1f} Hz, so increase the amplitude (twice), sweep slower or "
-        "repeat; a "
-        "wider band does not help."
+        "repeat; a wider band does not help."
     )

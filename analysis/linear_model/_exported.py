@@ -279,8 +279,7 @@ def linear_model(
         covariance_key = "covariance" if export_beam else "modal_model.covariance"
         raise LinearModelError(
             f"{identified.headline_name} has no {covariance_key}, as of an older version or of a "
-            "campaign, so no "
-            "samples can be drawn; analyze a session again, or add --samples 0."
+            "campaign, so no samples can be drawn; analyze a session again, or add --samples 0."
         )
     on_step("order")
     nominal_dynamics = uncertain_dynamics.nominal_dynamics

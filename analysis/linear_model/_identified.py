@@ -182,8 +182,7 @@ class IdentifiedModel:
         if length_m is None:
             raise LinearModelError(
                 f"{self.headline_name}: no file of the document states beam_length_m, or several "
-                "state "
-                f"different ones; {_ANALYZE_AGAIN_ADVICE}."
+                f"state different ones; {_ANALYZE_AGAIN_ADVICE}."
             )
         determined_names, covariance = self.beam_covariance() or ((), np.zeros((0, 0)))
         for key_name in determined_names:
@@ -234,8 +233,7 @@ class IdentifiedModel:
         if modal_fit is None:
             raise LinearModelError(
                 f"{self.headline_name} has no modal_model, as of an older version or of a "
-                "campaign; "
-                f"{_ANALYZE_AGAIN_ADVICE}, or export the beam's model with --beam."
+                f"campaign; {_ANALYZE_AGAIN_ADVICE}, or export the beam's model with --beam."
             )
         mode_count = len(modal_fit.poles_rad_s)
         constant_names, covariance = self.modal_covariance() or ((), np.zeros((0, 0)))

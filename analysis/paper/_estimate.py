@@ -107,9 +107,8 @@ def estimate(
     if not_finite_bins.size:
         raise FrequencyResponseError(
             f"{record.path}: the angle has no power at "
-            f"{response_to_fit.frequency_hz[not_finite_bins[0]]:g} "
-            "Hz, "
-            "so there is no frequency response there; choose a --band that was excited."
+            f"{response_to_fit.frequency_hz[not_finite_bins[0]]:g} Hz, so there is no frequency "
+            "response there; choose a --band that was excited."
         )
     return response_to_fit, whole_record_response
 
@@ -190,9 +189,8 @@ def estimate_warnings(
     )
     if is_welch and response.segments < PAPER_SEGMENTS:
         warning_sentences.append(
-            f"Only {response.segments} Welch segment(s) of {segment_length} samples fit "
-            "the sweep of "
-            f"{record.first_sweep_samples}{_segment_length_remedy(record.first_sweep_samples)}"
+            f"Only {response.segments} Welch segment(s) of {segment_length} samples fit the sweep "
+            f"of {record.first_sweep_samples}{_segment_length_remedy(record.first_sweep_samples)}"
         )
     resolution_hz = record.rate_hz / segment_length
     first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)

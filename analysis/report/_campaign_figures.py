@@ -141,8 +141,7 @@ def pooled_parameters_figure(campaign: CampaignResult) -> Figure:
         width_in, height_in,
         pooled_title(
             f"{session_count_text(headline_estimate, campaign)} — pooled whole-record estimate, "
-            "type "
-            f"{headline_estimate.name}",
+            f"type {headline_estimate.name}",
             campaign.homogeneity,
         ),
         f"freest type that the sessions support{exact_condition_text(campaign)}  ·  "

@@ -91,12 +91,11 @@ def structures_table(whole_record: WholeRecord) -> Table:
         (
             *unsupported_order_notes(unsupported_orders),
             "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE of "
-            "the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power over "
-            "that of the noise, 1 if nothing but noise is left. Free: number of free parameters, "
-            "including those of rig and beam. * at the limit of the search range. The marked row "
-            f"is {_highlighted_row_text(whole_record)}. The numbers of excluded structures are in "
-            "the CSV "
-            "file only, with the sums of squares.",
+            "the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power "
+            "over that of the noise, 1 if nothing but noise is left. Free: number of free "
+            "parameters, including those of rig and beam. * at the limit of the search range. "
+            f"The marked row is {_highlighted_row_text(whole_record)}. The numbers of excluded "
+            "structures are in the CSV file only, with the sums of squares.",
         ),
         highlighted_row=list(whole_record.fits).index(whole_record.headline.name),
     )
@@ -265,11 +264,10 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
         ),
         (
             *unsupported_order_notes(unsupported_orders),
-            f"Fit: NRMSE of the complex response in the band. {_FIT_INDEX_UNITS_NOTE} std (±): one "
-            "standard "
-            "deviation, from the scatter of the response about the model. The bias of Welch's "
-            "estimate on a chirp, which the window smears at the resonances, is not included and "
-            "is often larger; whole-record fits do not have it.",
+            f"Fit: NRMSE of the complex response in the band. {_FIT_INDEX_UNITS_NOTE} std (±): "
+            "one standard deviation, from the scatter of the response about the model. The bias "
+            "of Welch's estimate on a chirp, which the window smears at the resonances, is not "
+            "included and is often larger; whole-record fits do not have it.",
             *([_AT_LIMIT_NOTE] if any(fit.at_bounds for fit in fits) else []),
         ),
         is_grouped=True,

@@ -300,8 +300,7 @@ def _scale_notes(whole_record: WholeRecord) -> Iterator[str]:
         )
     yield (
         f"A wrong scale shows as {_scale_dependence_note(whole_record)}; no other parameter "
-        "depends on "
-        "these, and none on the stated density."
+        "depends on these, and none on the stated density."
     )
     density_result = density_check(
         whole_record.fit, whole_record.record.beam.density_kg_per_m, stated_uncertainty

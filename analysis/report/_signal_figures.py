@@ -359,9 +359,8 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
         13.0, 8.0, "Torque, measured and modelled",
         f"type {fitted_model.fit.structure.name}, weights {fitted_model.fit.weighting} (lowest "
         f"WMSE)  ·  exact model's response to the measured angle  ·  0 to {band_hz[1]:g} Hz  ·  "
-        "residual "
-        f"{1e3 * _rms(residual_nm):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the torque, "
-        "the bias of Welch's estimate included",
+        f"residual {1e3 * _rms(residual_nm):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the "
+        "torque, the bias of Welch's estimate included",
     )  # fmt: skip
     intervals = resonance_intervals(record, len(analysis.peaks))
     grid = figure.add_gridspec(

@@ -274,10 +274,9 @@ def _replace_report(
             folder, file_name, earlier_checksums
         ):
             raise OutputExistsError(
-                f"The report {folder} is unchanged: {file_name} in it was modified, or not "
-                "written by an analysis, and --overwrite does not replace such files; move it "
-                "away, or choose "
-                "another folder with --report."
+                f"The report {folder} is unchanged: {file_name} in it was modified, or not written "
+                "by an analysis, and --overwrite does not replace such files; move it away, or "
+                "choose another folder with --report."
             )
     try:
         # If this is interrupted, the list still contains all files.

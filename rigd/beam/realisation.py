@@ -278,17 +278,15 @@ def realise(
     if not relative_error <= max_relative_error:
         raise RealisationError(
             f"{damping} on {beam} is realised with a relative error of {relative_error:.1e} "
-            "between "
-            f"{ERROR_BAND_HZ[0]:g} and {ERROR_BAND_HZ[1]:g} Hz; {max_relative_error:.1e} was "
-            "requested."
+            f"between {ERROR_BAND_HZ[0]:g} and {ERROR_BAND_HZ[1]:g} Hz; {max_relative_error:.1e} "
+            "was requested."
         )
     realisation = _build_realisation(poles, modes, output_coefficients, relative_error)
     growth_per_s = _growth_on_frictionless_motor(realisation, beam)
     if growth_per_s > MAX_GROWTH_PER_S:
         raise RealisationError(
-            f"{damping} on {beam} is realised with a relative error of {relative_error:.1e}, "
-            "but a motor "
-            f"without friction would be unstable with it (growth {growth_per_s:.1e} 1/s)."
+            f"{damping} on {beam} is realised with a relative error of {relative_error:.1e}, but a "
+            f"motor without friction would be unstable with it (growth {growth_per_s:.1e} 1/s)."
         )
     return realisation
 

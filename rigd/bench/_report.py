@@ -87,8 +87,7 @@ def verdict(results: BenchResults) -> str:
     if between_stalls_hz is not None and between_stalls_hz != highest_hz:
         verdict_text += (
             f" Without stalls of {MIN_STALL_US * 1e-3:g} ms and more, which affect any rate, it "
-            "would "
-            f"have held {between_stalls_hz:g} Hz."
+            f"would have held {between_stalls_hz:g} Hz."
         )
     refused_setting_names = [
         setting_name

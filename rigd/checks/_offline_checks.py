@@ -224,9 +224,8 @@ def _require_acceptable_name(row_name: str) -> None:
     offline_check = _CHECK_BY_ROW_NAME.get(row_name)
     if offline_check is None:
         raise UnknownRowError(
-            f"--accept {row_name[:60]}: no row of rigd check has that name; those that can "
-            "be accepted "
-            f"are {', '.join(ACCEPTABLE_ROW_NAMES)}."
+            f"--accept {row_name[:60]}: no row of rigd check has that name; those that can be "
+            f"accepted are {', '.join(ACCEPTABLE_ROW_NAMES)}."
         )
     if offline_check.unacceptable_reason:
         raise UnknownRowError(

@@ -256,10 +256,9 @@ def _isolation_advice(last_core: int) -> str:
             "Isolated core: this computer has one core, which everything shares; use one with more."
         )
     return (
-        "Isolated core: other programs may share the loop's core. Boot with "
-        f"isolcpus={last_core} nohz_full={last_core} irqaffinity=0 (GRUB_CMDLINE_LINUX in "
-        "/etc/default/grub, "
-        "then update-grub)."
+        f"Isolated core: other programs may share the loop's core. Boot with isolcpus={last_core} "
+        f"nohz_full={last_core} irqaffinity=0 (GRUB_CMDLINE_LINUX in /etc/default/grub, then "
+        "update-grub)."
     )
 
 

@@ -170,9 +170,8 @@ def _start_advice(profile: str | None) -> str:
         )
     return (
         f"No live view{rig_text} is running. Start one with rigd run chirp --profile "
-        f"{profile_name} "
-        f"--live, or with rigd serve --profile {profile_name} --live; rigd live --wait waits "
-        "for it."
+        f"{profile_name} --live, or with rigd serve --profile {profile_name} --live; rigd live "
+        "--wait waits for it."
     )
 
 

@@ -61,9 +61,8 @@ def _print_report(report: "StopReport") -> None:
         for message_text in report.sessions_of_others
     ]
     problem_lines += [
-        f"Error: {message_text} was asked to stop, but its session did not end; check rigd "
-        "status and "
-        "the rig, and press the wired stop (STO) if anything moves."
+        f"Error: {message_text} was asked to stop, but its session did not end; check rigd status "
+        "and the rig, and press the wired stop (STO) if anything moves."
         for message_text in report.unended_sessions
     ]
     problem_lines += [

@@ -402,8 +402,7 @@ def stop_session(path: Path) -> Document:
         raise DaemonUnreachableError(last_failure, pid_and_uid)
     raise DaemonUnreachableError(
         f"The daemon (process {pid_and_uid[0]}) was sent {STOP_SIGNAL.name}, which asks it to "
-        "stop, and "
-        f"has not replied for {elapsed_s:.0f} s. {UNKNOWN_STATE_ADVICE}"
+        f"stop, and has not replied for {elapsed_s:.0f} s. {UNKNOWN_STATE_ADVICE}"
     )
 
 

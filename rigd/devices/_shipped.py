@@ -117,8 +117,7 @@ def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     if peak_to_rated_torque > _MAX_RATIO_TO_RATED_TORQUE:
         yield (
             f"motor.peak_torque_nm is {peak_to_rated_torque:g} times motor.rated_torque_nm; the "
-            "drive's target "
-            f"torque reaches {_MAX_RATIO_TO_RATED_TORQUE:g} times."
+            f"drive's target torque reaches {_MAX_RATIO_TO_RATED_TORQUE:g} times."
         )
     for key_prefix in ("", "drive_"):
         period_text, timeout_text = (
@@ -133,9 +132,8 @@ def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{key} = {profile_values[key]:g} s must be a whole number of milliseconds."
         if profile_values[timeout_text] < 2 * profile_values[period_text]:
             yield (
-                f"{timeout_text} = {profile_values[timeout_text]:g} s is below twice "
-                f"{period_text} = "
-                f"{profile_values[period_text]:g} s; a single late heartbeat would end a session."
+                f"{timeout_text} = {profile_values[timeout_text]:g} s is below twice {period_text} "
+                f"= {profile_values[period_text]:g} s; a single late heartbeat would end a session."
             )
 
     for entry_number, entry_text in enumerate(profile_values["cia402.set_objects"]):

@@ -126,9 +126,8 @@ def _read_columns(
     ):
         row_index = int(np.argmax(is_not_increasing)) + 1
         raise ExcitationError(
-            f"{path}: line {text_table.line_numbers[row_index]}: {TIME_COLUMN} does not come "
-            "after the "
-            "one before it; times must increase."
+            f"{path}: line {text_table.line_numbers[row_index]}: {TIME_COLUMN} does not come after "
+            "the one before it; times must increase."
         )
     return (None if time_column is None else time_column.values), angle_column.values
 
@@ -147,8 +146,8 @@ def _read_table(table_stream: BinaryIO) -> TextTable:
         if text_table.column_count > 1:
             raise TableError(
                 f"has {text_table.column_count} columns, {ANGLE_COLUMN} among them, but no "
-                f"{TIME_COLUMN}; "
-                f"name the column of times in seconds so, or leave {ANGLE_COLUMN} alone."
+                f"{TIME_COLUMN}; name the column of times in seconds so, or leave {ANGLE_COLUMN} "
+                "alone."
             )
         return text_table
     text_table = read_table(table_stream, ("#1",), max_rows=MAX_SAMPLES)

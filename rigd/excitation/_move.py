@@ -92,9 +92,8 @@ def move(
     if not abs(target_rad) <= farthest_allowed_rad:
         raise ExcitationError(
             f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
-            f"{rig_plant.max_angle_rad:g} rad allows {farthest_allowed_rad:.4g} rad from the "
-            "zero to "
-            "either side; choose at most "
+            f"{rig_plant.max_angle_rad:g} rad allows {farthest_allowed_rad:.4g} rad from the zero "
+            "to either side; choose at most "
             f"that{'' if by_rad is None else _allowed_range(farthest_allowed_rad, start_rad)}."
         )
     distance_rad = target_rad - start_rad
@@ -170,10 +169,8 @@ def _move_text(parameters: Mapping[str, float | int | str]) -> str:
             "uncertainty"
         )
     return (
-        f"moves by {move_rad:.4g} rad to {target_angle_rad:.4g} rad in {1e3 * duration_s:.0f} "
-        "ms, the angle "
-        f"within 1 mrad {arrival_text} ({100 * residual_fraction:.0f} % of the limits); "
-        "vibration left "
-        f"{residual_text}; a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
-        f"{parameters['file'] or 'profile'})"
+        f"moves by {move_rad:.4g} rad to {target_angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms, "
+        f"the angle within 1 mrad {arrival_text} ({100 * residual_fraction:.0f} % of the limits); "
+        f"vibration left {residual_text}; a quintic of the same time leaves {1e3 * quintic_nm:.3g} "
+        f"mN·m (beam of {parameters['file'] or 'profile'})"
     )

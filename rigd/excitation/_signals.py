@@ -178,9 +178,8 @@ def require_within_turn(option_name: str, option_value_rad: float) -> None:
     """Raise `ExcitationError` if an option's angle is more than a full turn to either side."""
     if abs(option_value_rad) > 2.0 * pi:
         raise ExcitationError(
-            f"{option_name} = {option_value_rad:g} rad is more than a full turn; give an angle "
-            "in rad of at "
-            f"most {2.0 * pi:.3f}."
+            f"{option_name} = {option_value_rad:g} rad is more than a full turn; give an angle in "
+            f"rad of at most {2.0 * pi:.3f}."
         )
 
 
@@ -199,8 +198,7 @@ def require_frequency(
     if option_value > max_frequency_hz:
         raise ExcitationError(
             f"{option_name} = {option_value:g} Hz leaves fewer than {MIN_SAMPLES_PER_PERIOD} "
-            "samples per "
-            f"period at {rate_hz:g} Hz; choose at most {max_frequency_hz:g} Hz."
+            f"samples per period at {rate_hz:g} Hz; choose at most {max_frequency_hz:g} Hz."
         )
 
 
@@ -252,10 +250,9 @@ def check_ticks(
             else ""
         )
         raise ExcitationError(
-            f"{message_start} would take {tick_count / rate_hz:g} s; {max_duration_s:g} s is "
-            "the most at "
-            f"{rate_hz:g} Hz{limit_text}, because no more than {MAX_SAMPLES} samples can be "
-            "analysed, exported or replayed: shorten it or run several sessions."
+            f"{message_start} would take {tick_count / rate_hz:g} s; {max_duration_s:g} s is the "
+            f"most at {rate_hz:g} Hz{limit_text}, because no more than {MAX_SAMPLES} samples can "
+            "be analysed, exported or replayed: shorten it or run several sessions."
         )
 
 

@@ -209,8 +209,7 @@ def until(
     if scan_s < 2 * _SCAN_FADE_S:
         raise ExcitationError(
             f"scan_s = {scan_s:g} s is too short for fades of {_SCAN_FADE_S:g} s at both ends; "
-            "choose "
-            f"at least {2 * _SCAN_FADE_S:g} s."
+            f"choose at least {2 * _SCAN_FADE_S:g} s."
         )
     check_ticks("With at_most_s, the session", at_most_s * rate_hz, rate_hz)
     planned_ticks = sweep_end + round(SEGMENT_PAUSE_S * rate_hz)

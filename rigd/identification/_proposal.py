@@ -334,10 +334,8 @@ def _operator_notes(estimate: MotorEstimate, profile: Profile, unusable_count: i
     if omitted_count:
         operator_notes.append(
             f"{omitted_count} of {omitted_count + estimate.window_count} passes were left out: "
-            f"{unusable_count} with "
-            f"missed ticks or held readings, {estimate.dropped_window_count} in which the shaft "
-            "may have stood "
-            "still."
+            f"{unusable_count} with missed ticks or held readings, {estimate.dropped_window_count} "
+            "in which the shaft may have stood still."
         )
     return operator_notes
 

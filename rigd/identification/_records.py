@@ -76,9 +76,8 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         for other_path, other_digest in digests_by_path.items():
             if tick_digests & other_digest:
                 raise MotorEstimateError(
-                    f"{session_path}: it has samples of {other_path}, noise included, which "
-                    "would count twice; "
-                    "give each session once."
+                    f"{session_path}: it has samples of {other_path}, noise included, which would "
+                    "count twice; give each session once."
                 )
         digests_by_path[session_path] = tick_digests
         rig_data = (
@@ -94,9 +93,8 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
             first_rig_data = rig_data
         if rig_data != first_rig_data:
             raise MotorEstimateError(
-                f"{session_path}: its rate, delays or tool inertia are not those of "
-                f"{paths[0]}; give "
-                "sessions of one rig."
+                f"{session_path}: its rate, delays or tool inertia are not those of {paths[0]}; "
+                "give sessions of one rig."
             )
         usable_passes, pass_count = _read_passes(session, session_number, rig_data[0].rate_hz)
         pass_readings += usable_passes

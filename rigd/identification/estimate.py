@@ -512,9 +512,8 @@ def estimate_motor(
     inertia_kg_m2 = float(fitted_values[INERTIA_INDEX])
     if inertia_kg_m2 <= 0.0:
         raise MotorEstimateError(
-            f"The fit ends at an inertia of {inertia_kg_m2:.3g} kg·m²: the record does not "
-            "show the "
-            "motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
+            f"The fit ends at an inertia of {inertia_kg_m2:.3g} kg·m²: the record does not show "
+            "the motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
         )
     torque_jump_fraction = tool_inertia_kg_m2 / (inertia_kg_m2 + tool_inertia_kg_m2)
     jump_instant_std_s = torque_jump_fraction / timing.rate_hz / sqrt(12.0)

@@ -201,11 +201,10 @@ def _passes_with_multisine(
             peak_torque_nm - passes_peak_torque_nm
         )
         raise ExcitationError(
-            f"--torque-percent {torque_percent:g}: of {allowed_torque_nm:.3g} N·m the passes "
-            "alone take "
-            f"{passes_peak_torque_nm:.3g} N·m, and too little is left for the multisine; allow "
-            "at least "
-            f"{_rounded_torque_percent(profile, sufficient_torque_nm)} % or a shorter --stroke-rad."
+            f"--torque-percent {torque_percent:g}: of {allowed_torque_nm:.3g} N·m the passes alone "
+            f"take {passes_peak_torque_nm:.3g} N·m, and too little is left for the multisine; "
+            f"allow at least {_rounded_torque_percent(profile, sufficient_torque_nm)} % or a "
+            "shorter --stroke-rad."
         )
     return _checked_excitation(
         excitation_name,
@@ -245,8 +244,7 @@ def constant_speeds_excitation(
     if peak_torque_nm > torque_limit_nm:
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: the turns take {peak_torque_nm:.3g} N·m and "
-            "only "
-            f"{torque_limit_nm:.3g} N·m are allowed; allow at least "
+            f"only {torque_limit_nm:.3g} N·m are allowed; allow at least "
             f"{_rounded_torque_percent(profile, peak_torque_nm)} % or a shorter --stroke-rad."
         )
     return _checked_excitation(
@@ -463,9 +461,8 @@ def _checked_excitation(
     peak_angle_rad = float(np.max(np.abs(closed_loop.simulate(reference_rad).angle_rad)))
     if peak_angle_rad > stroke_rad:
         raise ExcitationError(
-            f"--stroke-rad {stroke_rad:g}: the predicted peak angle is {peak_angle_rad:.3g} "
-            "rad; allow "
-            "more."
+            f"--stroke-rad {stroke_rad:g}: the predicted peak angle is {peak_angle_rad:.3g} rad; "
+            "allow more."
         )
     rate_hz = profile.rig.rate_hz
     reference_rad.flags.writeable = False

@@ -227,9 +227,8 @@ def _drag_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     for key_name in INCOMPATIBLE_WITH_FORCES:
         if profile_values.get(f"simulation.{key_name}"):
             yield (
-                f"simulation.{key_name} and simulation.air_drag_m cannot be simulated "
-                "together; leave "
-                "one of them out, or make it 0."
+                f"simulation.{key_name} and simulation.air_drag_m cannot be simulated together; "
+                "leave one of them out, or make it 0."
             )
 
 
@@ -301,20 +300,16 @@ def _unreachable_limit_messages(profile_values: Mapping[str, Any]) -> Iterator[s
     )
     if error_limit_rad >= 2 * angle_rad:
         yield (
-            f"limits.tracking_error_rad = {error_limit_rad:g} rad can never be exceeded: "
-            "reference and angle "
-            f"are within {angle_limits_text}; choose less than {2 * angle_rad:g} rad, some three "
-            "times the "
-            "error of your excitation."
+            f"limits.tracking_error_rad = {error_limit_rad:g} rad can never be exceeded: reference "
+            f"and angle are within {angle_limits_text}; choose less than {2 * angle_rad:g} rad, "
+            "some three times the error of your excitation."
         )
     max_speed_rad_s = sqrt(2 * motor_acceleration_rad_s2 * 2 * angle_rad)
     if speed_limit_rad_s >= max_speed_rad_s:
         yield (
-            f"limits.velocity_rad_s = {speed_limit_rad_s:g} rad/s can never be exceeded: the "
-            "peak torque "
-            f"accelerates the motor alone to {max_speed_rad_s:.4g} rad/s between "
-            f"{angle_limits_text}; choose "
-            "less, some three times the speed of your excitation."
+            f"limits.velocity_rad_s = {speed_limit_rad_s:g} rad/s can never be exceeded: the peak "
+            f"torque accelerates the motor alone to {max_speed_rad_s:.4g} rad/s between "
+            f"{angle_limits_text}; choose less, some three times the speed of your excitation."
         )
     acceleration_limit_rad_s2 = profile_values["limits.acceleration_rad_s2"]
     if acceleration_limit_rad_s2 > _MAX_LIMIT_TO_MOTOR_ACCELERATION * motor_acceleration_rad_s2:
@@ -380,8 +375,7 @@ def unknown_key_message(profile_key: str, profile_values: Mapping[str, Any]) -> 
             return (
                 f"{profile_key} = {_shown_value(profile_values[profile_key])} has the wrong unit "
                 f"('{profile_key.removeprefix(key_without_unit + '_')}'); write {candidate_key}, "
-                "the value in "
-                f"{UNITS[unit_suffix]}."
+                f"the value in {UNITS[unit_suffix]}."
             )
     similar_names = difflib.get_close_matches(profile_key, section_keys, 1)
     if similar_names:

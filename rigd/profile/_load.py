@@ -273,8 +273,7 @@ def _resolve_eds_path(profile_path: Path, values_by_key: dict[str, Any]) -> Iter
     if not eds_path.is_file():
         yield (
             f'cia402.eds = "{eds_name}": there is no file {eds_path}; give its path, relative to '
-            "the "
-            "profile's folder, or remove the key."
+            "the profile's folder, or remove the key."
         )
 
 

@@ -304,8 +304,7 @@ def _await_quick_looks(quick_looks: QuickLookQueue, stop: StopRequest) -> None:
         )
         _print(
             f"The quick look {skip_reason} and was skipped: python -m analysis.quick_look FILE "
-            "makes "
-            "it.",
+            "makes it.",
             to_stderr=True,
         )
     stop.requested = was_stopped  # this Ctrl-C skipped the quick look only

@@ -125,8 +125,7 @@ class Series:
         if excitation.stays and session_count > 1:
             raise RefusedError(
                 f"--repeat {session_count}: a {excitation.kind} does not end where it starts, so "
-                "it is "
-                "run once; omit the option."
+                "it is run once; omit the option."
             )
         self.plan = plan_session(
             profile,

@@ -125,11 +125,9 @@ def tip_in_words(predicted_tip_motion: TipMotion | None, beam: Beam, excitation:
             f"up to {100 * relative_model_error:.2g}" if relative_model_error < 1.0 else "above 100"
         )
         motion_text = (
-            f"Predicted tip slope: {predicted_tip_motion.slope_rad:.2g} rad. The linear model "
-            "does not hold there "
-            f"(error {error_percent_text} %): the predicted deflection is larger than the beam "
-            "allows, and "
-            "deflection and speed of the tip are not known"
+            f"Predicted tip slope: {predicted_tip_motion.slope_rad:.2g} rad. The linear model does "
+            f"not hold there (error {error_percent_text} %): the predicted deflection is larger "
+            "than the beam allows, and deflection and speed of the tip are not known"
         )
     else:
         deflection_fraction = predicted_tip_motion.deflection_m / beam.length_m

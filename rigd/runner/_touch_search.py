@@ -54,8 +54,8 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
         beam_file_path = profile.path if profile.specimen is None else profile.specimen.path
         raise RefusedError(
             f"{beam_file_path}: beam.tip_mass_kg = {profile.tip_mass_kg:.4g} kg: a search for "
-            "touches does "
-            "not take a mass at the tip into account; take it off, and remove the key."
+            "touches does not take a mass at the tip into account; take it off, and remove the "
+            "key."
         )
     from rigd.touch import DetectorSettings, TouchModel, detector_model
 

@@ -195,9 +195,8 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
         shown_path = printable(str(simulator_path))  # another user may have chosen any name
         raise RefusedError(
             f"A simulated rig of {profile.name} is run {owner_name} ({shown_path}), which this "
-            "command "
-            f"does not reach, and the hardware would move instead. Either {remedy}, or end it, or "
-            "give --hardware if the hardware is meant."
+            f"command does not reach, and the hardware would move instead. Either {remedy}, or end "
+            "it, or give --hardware if the hardware is meant."
         )
 
 
@@ -374,8 +373,8 @@ def remaining_file_text(session_path: Path | None) -> str:
         )
     return (
         f"What was recorded is in {part_file_path}, whose name without {PART_SUFFIX} is taken: "
-        "after "
-        f"mv {old_path_text} {new_path_text} rigd recover {new_path_text} makes a clean file of it."
+        f"after mv {old_path_text} {new_path_text} rigd recover {new_path_text} makes a clean file "
+        "of it."
     )
 
 

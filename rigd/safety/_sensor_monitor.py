@@ -135,9 +135,8 @@ class SensorMonitor:
         ):
             if has_noise and repeat_fraction > _NO_NOISE_REPEAT_FRACTION:
                 self._notices.append(
-                    f"The sensor's {channel_name} shows no noise at rest: a broken gauge or "
-                    "cable is "
-                    "not detected there. Check the sensor."
+                    f"The sensor's {channel_name} shows no noise at rest: a broken gauge or cable "
+                    "is not detected there. Check the sensor."
                 )
         return None
 

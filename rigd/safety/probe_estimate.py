@@ -376,9 +376,8 @@ def _coupling_contradiction(estimate: ProbeEstimate, *, with_motor: bool) -> str
             "encoder and motor torque both are (cia402.direction)."
         )
     return (
-        f"the coupling torque is {ratio_text} times that of the profile's beam at the "
-        "measured angle: "
-        f"{_likely_cause(estimate, coupling_ratio)}."
+        f"the coupling torque is {ratio_text} times that of the profile's beam at the measured "
+        f"angle: {_likely_cause(estimate, coupling_ratio)}."
     )
 
 

@@ -322,9 +322,8 @@ class MessageDecoder:
         if record_size > limits.MAX_SAMPLE_MESSAGE_BYTES:
             raise SessionError(
                 f"{self._path}: a message of {fixed_layout.topic} has {record_size} bytes, more "
-                "than the "
-                f"{limits.MAX_SAMPLE_MESSAGE_BYTES} that are read. The writing program must write "
-                "one sample per message."
+                f"than the {limits.MAX_SAMPLE_MESSAGE_BYTES} that are read. The writing program "
+                "must write one sample per message."
             )
         if (
             self._has_fixed_schema(contents, channel_id)

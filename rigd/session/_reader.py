@@ -119,8 +119,8 @@ class Session:
         if not isfinite(parsed_number):
             raise SessionError(
                 f"{self.path}: {key} in the metadata 'session' is {quoted_excerpt(number_text)}, "
-                "which is "
-                f"not a finite number. The writing program must state it as a number{unit_text}."
+                "which is not a finite number. The writing program must state it as a "
+                f"number{unit_text}."
             )
         return parsed_number
 

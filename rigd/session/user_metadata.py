@@ -115,9 +115,8 @@ def _number_text(metadata_name: str, metadata_value: object) -> str:
     if number is None:
         raise MetadataError(
             f"metadata {metadata_name} = {_shown_value(metadata_value)} is not a finite number; "
-            "the name ends in a "
-            f"unit, so give a number in {unit_of(metadata_name)} with a decimal point, or choose "
-            "another name."
+            f"the name ends in a unit, so give a number in {unit_of(metadata_name)} with a decimal "
+            "point, or choose another name."
         )
     return repr(number)
 

@@ -181,9 +181,8 @@ def _check_recovery_from_limit(profile: Profile) -> None:
     _require(
         saturated_ticks == 0 and largest_angle_rad <= limits.tracking_error_rad,
         f"{_MAX_RECOVERY_S - _RECOVERY_CHECK_S:g} s after the torque was at its limit, the shaft "
-        "is still "
-        f"{largest_angle_rad:.3g} rad away, and {saturated_ticks} ticks are at the limit: stop the "
-        "states from winding up (anti_windup)",
+        f"is still {largest_angle_rad:.3g} rad away, and {saturated_ticks} ticks are at the "
+        "limit: stop the states from winding up (anti_windup)",
     )
 
 

@@ -528,8 +528,7 @@ def not_a_number_error(line_number: int, column_name: str, cell_text: str) -> Ta
         return TableError(
             f"line {line_number}: '{column_name}' is a date or a time of day{{cell}} that is not "
             "understood; write times as 2026-11-25 12:00:00.001 or in seconds, or leave them out "
-            "and state the "
-            "rate (--rate-hz).",
+            "and state the rate (--rate-hz).",
             cell_text,
         )
     return TableError(
@@ -734,8 +733,7 @@ def _check_split_decimals(rows: Sequence[TextRow], layout: TableLayout) -> None:
     ]
     if are_split_decimals(nonempty_rows):
         raise TableError(
-            f"line {rows[0].line_number}: every second cell between commas looks like the "
-            "decimals of the "
-            "one before it; save the file with decimal points, or with semicolons or tabs between "
-            "the columns."
+            f"line {rows[0].line_number}: every second cell between commas looks like the decimals "
+            "of the one before it; save the file with decimal points, or with semicolons or tabs "
+            "between the columns."
         )

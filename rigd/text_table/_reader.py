@@ -326,8 +326,8 @@ class _NumberRowReader:
         if is_stamp(cell):
             raise TableError(
                 f"line {line_number}: '{self.column_name(column_index)}' is of another "
-                f"day{{cell}}, and "
-                "the order of day and month is not clear; write the date as 2026-11-25.",
+                f"day{{cell}}, and the order of day and month is not clear; write the date as "
+                "2026-11-25.",
                 cell,
             )
         raise not_a_number_error(line_number, self.column_name(column_index), cell)
@@ -341,10 +341,8 @@ class _NumberRowReader:
         if is_number(cell, POINT):
             return TableError(
                 f"line {line_number}: '{self.column_name(column_index)}' has a decimal "
-                f"point{{cell}}, "
-                "and other numbers have decimal commas; save the file with one of them, and "
-                "without "
-                "separators between thousands.",
+                f"point{{cell}}, and other numbers have decimal commas; save the file with one of "
+                "them, and without separators between thousands.",
                 cell,
             )
         return not_a_number_error(line_number, self.column_name(column_index), cell)
@@ -369,10 +367,8 @@ class _NumberRowReader:
                 raise TableError(
                     f"line {thousands_check.first_grouped_line}: the {sign_noun} in "
                     f"'{self.column_name(column_index)}' may be decimal signs or separators "
-                    "between "
-                    "thousands, as each has three digits behind it; save the file with decimal "
-                    "points and "
-                    "without separators between thousands."
+                    "between thousands, as each has three digits behind it; save the file with "
+                    "decimal points and without separators between thousands."
                 )
 
 

@@ -246,9 +246,8 @@ class NetFtSensor:
         if abs(self._counter_rise - received_records * self._counter_step) > 1:
             raise self._box_error(
                 f"its counter rises by {self._counter_rise} in {received_records} records, so it "
-                "does not "
-                f"send {self._settings.rate_hz:g} records per second; correct netft.rate_hz or the "
-                "rate in the box."
+                f"does not send {self._settings.rate_hz:g} records per second; correct "
+                "netft.rate_hz or the rate in the box."
             )
 
     def _read_records(self) -> int:

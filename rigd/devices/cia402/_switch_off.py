@@ -221,9 +221,8 @@ def _confirm_ready(
         f"{drive_name}: {progress_text}, and it is disabled, but it does not get ready: on that "
         "command "
         f'it stays in "{present_state.value}" (statusword 0x{statusword:04X}, bit 4: the motor '
-        "supply "
-        f"{supply_text}). STO is open or the motor supply is off; release or switch it on, then: "
-        f"{reset_command}"
+        f"supply {supply_text}). STO is open or the motor supply is off; release or switch it on, "
+        f"then: {reset_command}"
     )
 
 
