@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import os
 import re
 import subprocess
 import sys
@@ -102,17 +103,22 @@ def test_invalid_uniformity_of_a_search_is_refused(rigd_here, tmp_path, percent)
 
 
 @pytest.mark.parametrize(
-    ("options", "simulate"),
+    ("options", "how_to_simulate"),
     [
-        (("--fast",), "rigd simulate --profile antenna_can --lock-step in another terminal"),
-        (("--seed", "1"), "rigd simulate --profile antenna_can in another terminal"),
-        further(("--obstacle", "x=0.5,angle=1"), "rigd simulate --profile antenna_can"),
+        (("--fast",), " --lock-step in another terminal"),
+        (("--seed", "1"), " in another terminal"),
+        further(("--obstacle", "x=0.5,angle=1"), " in another terminal"),
     ],
 )
-def test_options_of_simulated_rigs_are_refused_on_hardware(rigd_here, tmp_path, options, simulate):
+def test_options_of_simulated_rigs_are_refused_on_hardware(
+    rigd_here, tmp_path, write_profile, options, how_to_simulate
+):
     """The message does not advise to omit the option, after which the motor would move."""
-    done = rigd_here("run", "chirp", "--profile", "antenna_can", *options)
-    assert_refused(done, 2, options[0], "profile of hardware", "would move the motor", simulate)
+    # The name is unique: a simulated antenna_can of another test would be mentioned instead.
+    profile = write_profile("antenna_can", {"name": f'"wrong_use_{os.getpid()}"'})
+    done = rigd_here("run", "chirp", "--profile", profile, *options)
+    remedy = f"rigd simulate --profile {profile}{how_to_simulate}"
+    assert_refused(done, 2, options[0], "profile of hardware", "would move the motor", remedy)
     assert "omit" not in done.stderr
     assert not (tmp_path / "sessions").exists()
 
