@@ -24,6 +24,7 @@ import numpy as np
 
 from analysis.identify._modal_model import MODE_CONSTANT_NAMES, ModalEstimate
 from analysis.identify._modal_problem import ModalProblem, column_blocks
+from analysis.identify._visible_modes import is_excited
 from analysis.identify.noise import noise_power_with_peaks, smooth_power
 from analysis.identify.residual_tests import input_relation, whiteness
 from analysis.optimizer import ConstantBounds, descend
@@ -492,12 +493,21 @@ class _ModalSearch:
         Where the reference does not excite the motor, its angle is noise. A mode fitted there
         predicts a torque that was not measured, and its damping falls to its bound to make this
         torque small. The fit gives evidence for the mode nevertheless, because it estimates the
-        incoherent part of angle and torque with the mode itself.
+        incoherent part of angle and torque with the mode itself. A mode that the reference excites
+        stays: it may lose its damping to drag, or to an impact that is not in the model.
         """
+        mode_hz = np.exp(self.mode_unknowns[::2]) / (2 * np.pi)
         is_undamped = self.mode_unknowns[1::2] < 2 * _MIN_LOSS_FACTOR
-        if is_undamped.all() or not is_undamped.any():
+        damped_hz = mode_hz[~is_undamped].tolist()
+        is_removed = is_undamped.copy()
+        for i in np.flatnonzero(is_undamped):
+            is_removed[i] = not any(
+                is_excited(self.comparison, float(mode_hz[i]), compared_hz=other_hz)
+                for other_hz in damped_hz
+            )
+        if is_undamped.all() or not is_removed.any():
             return self
-        search = self._remove_modes(is_undamped)
+        search = self._remove_modes(is_removed)
         return search.converge_with_noise().remove_undamped_modes()
 
     def _remove_modes(self, removed_modes: int | NDArray[np.bool_]) -> _ModalSearch:

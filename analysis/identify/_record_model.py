@@ -281,11 +281,9 @@ def fit_modal_model(
     if candidate_set.misread_findings:
         return None
     mode_starts = _mode_starts(candidate_set.likeliest_fit.modes)
-    torque_spectra, drag_expansion = candidate_set.effect_spectra, candidate_set.comparison.drag
+    torque_spectra = candidate_set.effect_spectra
     if added_spectra is not None:
         torque_spectra = np.concatenate([torque_spectra, added_spectra])
-    if drag_expansion is not None:  # the size of the drag is not known exactly
-        torque_spectra = np.concatenate([torque_spectra, drag_expansion.law_derivatives])
     return fit_modes(candidate_set.comparison, candidate_set.noise, mode_starts, torque_spectra)
 
 
