@@ -20,8 +20,9 @@ if TYPE_CHECKING:  # it imports numpy, which takes longer than a stop may take
 
 _MAX_REPLY_BYTES = 65_536
 """Largest length in bytes of a simulator's reply."""
-_REPLY_TIMEOUT_S = 2.0
-"""Time in seconds to wait for a simulator's reply."""
+_REPLY_TIMEOUT_S = 10.0
+"""Time in seconds to wait for a simulator's reply. A busy computer may take seconds to compute a
+beam with a new obstacle."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,9 +41,14 @@ _SAME_RATIO_FACTOR = 1.3
 """Factor by which two ratios may differ and still count as the same."""
 _NO_TORQUE_RATIO = 0.15
 """Ratio of measured torque to beam's torque below which the sensor counts as dead."""
-_PROBE_ADVICE = (
-    "Correct the profile or the rig. A value that was measured by other means and is marked "
-    'source = "measured" (docs/safety.md) is not probed.'
+_MEASURED_VALUE_ADVICE = (
+    'A value that was measured by other means and is marked source = "measured" (docs/safety.md) '
+    "is not probed."
+)
+_CONTRADICTION_ADVICE = f"Correct the profile or the rig. {_MEASURED_VALUE_ADVICE}"
+_UNDETERMINED_ADVICE = (
+    "Start the session again while the computer does nothing else: late ticks, for example, make "
+    f"the estimate uncertain. {_MEASURED_VALUE_ADVICE}"
 )
 
 
@@ -298,7 +303,10 @@ def contradiction(
             f"up to {estimate.speed_rad_s:.2g} rad/s: check motor.inertia_kg_m2, "
             "motor.rated_torque_nm and encoder.resolution_rad."
         )
-    return f"Probing move: {description} {_PROBE_ADVICE}" if description else ""
+    if description:
+        return f"Probing move: {description} {_CONTRADICTION_ADVICE}"
+    undetermined = _undetermined_motor(estimate) if with_motor else ""
+    return f"Probing move: {undetermined} {_UNDETERMINED_ADVICE}" if undetermined else ""
 
 
 def doubts(estimate: ProbeEstimate) -> list[str]:
@@ -403,26 +411,34 @@ def _likely_cause(estimate: ProbeEstimate, ratio: float) -> str:
 
 def _motor_contradiction(estimate: ProbeEstimate) -> str:
     """Describe a torque or inertia of the motor that contradicts the profile, or return ""."""
-    checked_ratios = (
-        ("the motor exerts", estimate.torque_ratio, estimate.torque_std,
+    for verb, ratio, std, quantity in _motor_ratios(estimate):
+        if ratio is not None and std is not None and not _is_ratio_accepted(ratio):
+            return f"the motor {verb} {ratio:.2g} ± {std:.1g} times {quantity}."
+    return ""
+
+
+def _undetermined_motor(estimate: ProbeEstimate) -> str:
+    """Describe which properties of the motor the move did not determine, or return ""."""
+    undetermined = [
+        quantity
+        for _, ratio, std, quantity in _motor_ratios(estimate)
+        if ratio is None or std is None or std > _MAX_RELATIVE_STD * ratio
+    ]
+    if not undetermined:
+        return ""
+    return f"it could not be determined whether the motor agrees with {' and '.join(undetermined)}."
+
+
+def _motor_ratios(
+    estimate: ProbeEstimate,
+) -> tuple[tuple[str, float | None, float | None, str], ...]:
+    """Return verb, ratio, its standard deviation and quantity of the profile for messages."""
+    return (
+        ("exerts", estimate.torque_ratio, estimate.torque_std,
          "the torque commanded (motor.rated_torque_nm, or the drive's rated torque)"),
-        ("the motor has", estimate.inertia_ratio, estimate.inertia_std,
+        ("has", estimate.inertia_ratio, estimate.inertia_std,
          "the inertia of the profile (motor.inertia_kg_m2)"),
     )  # fmt: skip
-    unknown_clauses = []
-    for clause, checked_ratio, std, quantity in checked_ratios:
-        if checked_ratio is None or std is None:
-            unknown_clauses.append(quantity)
-        elif not _is_ratio_accepted(checked_ratio):
-            return f"{clause} {checked_ratio:.2g} ± {std:.1g} times {quantity}."
-        elif std > _MAX_RELATIVE_STD * checked_ratio:
-            unknown_clauses.append(quantity)
-    if unknown_clauses:
-        return (
-            "it could not be determined whether the motor agrees with "
-            f"{' and '.join(unknown_clauses)}."
-        )
-    return ""
 
 
 def _is_same_ratio(first_ratio: float, second_ratio: float) -> bool:

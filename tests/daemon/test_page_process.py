@@ -122,7 +122,7 @@ def test_error_if_a_requested_port_is_taken(serve, monkeypatch, caplog):
         port = taken.getsockname()[1]
         page = serve(port)
         page._thread.join(60.0)
-        assert f"port {port} cannot be had" in caplog.text
+        assert f"port {port} cannot be opened" in caplog.text
         assert page_address("sim") is None
         monkeypatch.setattr(_page, "PAGE_PORT", port)
         other = serve()

@@ -228,7 +228,12 @@ class Scene:
         return self.start("run", "chirp", *where, *CHIRP)
 
     def chirp(self) -> Done:
-        return self.finish(self.start_chirp())
+        """Run a session; start it again, as the message advises, if late ticks hide the motor."""
+        for _ in range(3):
+            done = self.finish(self.start_chirp())
+            if "could not be determined" not in done.last:
+                break
+        return done
 
     def await_torque(self, patience_s: float = _STARTED_S) -> None:
         """Wait until the motor is moved."""

@@ -1,11 +1,14 @@
 """The probing move finds wrong scales and signs before the shaft leaves its limits."""
 
+from dataclasses import replace
+
 import pytest
 from bench_probing import Mismatch, mismatches, probe
 from cases import further
 
 from rigd.engine import probed_rig
 from rigd.profile import load_profile
+from rigd.safety.probe_estimate import contradiction
 from rigd.safety.probing_move import ProbeEnd, plan_probe
 
 STEP, RATED, INERTIA = "encoder.resolution_rad", "motor.rated_torque_nm", "motor.inertia_kg_m2"
@@ -66,6 +69,16 @@ def test_a_quarter_too_much_or_too_little_is_accepted(profile, mismatch, coulomb
     assert done.end is ProbeEnd.COMPLETE
     assert done.contradiction == ""
     assert done.estimate.coulomb_nm == pytest.approx(coulomb_nm, rel=0.1)
+
+
+def test_undetermined_motor_is_no_contradiction(profile):
+    done = probe(profile, Mismatch(), coulomb_nm=0.1)
+    vague = replace(done.estimate, inertia_std=0.2 * done.estimate.inertia_ratio)
+    text = contradiction(probed_rig(profile), done.end, vague)
+    assert "could not be determined whether the motor agrees with the inertia" in text
+    assert "Start the session again" in text
+    assert "Correct the profile" not in text
+    assert contradiction(probed_rig(profile), done.end, vague, with_motor=False) == ""
 
 
 def test_a_shaft_that_does_not_move_is_refused(profile):

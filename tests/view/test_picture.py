@@ -160,9 +160,9 @@ def test_a_recorded_session_shows_its_touches(touch_file, drawn, make_timings):
     [
         {"sweep": (1000, 1000)},
         further({"sweep": (1000, 1003)}),
-        further({"rate_hz": 100.0, "ticks": 3000, "sweep": (0, 3000)}),
+        further({"rate_hz": 100.0, "scheduled_ticks": 3000, "sweep": (0, 3000)}),
         further({"damping": None}),
-        further({"ticks": 0, "sweep": (0, 0)}),
+        further({"scheduled_ticks": 0, "sweep": (0, 0)}),
     ],
 )
 def test_any_session_can_be_shown(description, make_samples, shown, changes):
