@@ -40,6 +40,7 @@ from analysis.campaigns._validation import (
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
 from analysis.campaigns.pooling import PooledEstimate, PooledMode, freest_estimate, pooled_estimates
+from analysis.campaigns.specimen_sentences import WRONG_METADATA_REMEDY
 from analysis.campaigns.workers import FailedTask, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.validity import combined_validity
@@ -425,7 +426,7 @@ def _exclusion_reason(
     if difference:
         return (
             f"{difference} in {reference_session.path}{majority_text}; a campaign repeats one "
-            "experiment on one specimen: analyse this one by itself, or correct the metadata."
+            f"experiment on one specimen: analyse this one by itself. {WRONG_METADATA_REMEDY}"
         )
     if isinstance(session_result, SessionFailure):
         return None

@@ -25,6 +25,11 @@ MIXTURE_NOTE: Final = (
     "mixture, which may be valid for none of them."
 )
 """Footnote that explains `MIXTURE_MARK`."""
+WRONG_METADATA_REMEDY: Final = (
+    "If the metadata of a file are wrong, export its record and import it again with the right "
+    "ones (analyze export record, analyze import)."
+)
+"""What to do about a file that states a wrong specimen or experiment."""
 _SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
 """Largest relative scatter of a frequency that a single beam may show: ten kelvin change the
 stiffness of steel by 0.3 %."""
@@ -74,7 +79,7 @@ def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]
     return [
         f"The files state {len(specimens)} different specimens: {specimen_texts}. Specimens are "
         f"never pooled: all results below are for {first_specimen}. Analyse the files of the "
-        "others separately, or correct the metadata where they are wrong."
+        f"others separately. {WRONG_METADATA_REMEDY}"
     ]
 
 

@@ -549,7 +549,7 @@ class _ModalSearch:
     def fit(self) -> ModalFit | None:
         """Return the modal fit after the removal of modes that do not reduce the cost enough.
 
-        Return None if no mode remains. The removed modes are undetermined.
+        Return None if no mode of the beam remains. The removed modes are undetermined.
         """
         frequency_order = np.argsort(self.mode_unknowns[::2])
         search = replace(
@@ -561,7 +561,7 @@ class _ModalSearch:
         while cost_increases.size and cost_increases.min() < _MIN_DEVIANCE_REDUCTION_BY_MODE:
             search = search._remove_modes(int(np.argmin(cost_increases))).descend_to_minimum()
             cost_increases = search.cost_increases_without_mode()
-        if not cost_increases.size:
+        if not any(search.mode_numbers):  # additional resonances alone are no model of the beam
             return None
         mode_unknowns, mode_numbers = search.mode_unknowns, search.mode_numbers
         problem = search.problem()

@@ -132,6 +132,15 @@ def test_very_different_clocks_flag_every_number():
     assert all(mode.damping_ratio.flag for mode in selection.headline.modes)
 
 
+@pytest.mark.further  # as other records without a visible mode
+def test_clocks_that_hide_every_mode_are_reported():
+    """Only resonances outside the beam remain in the modal model, which is none of the beam."""
+    selection = select(record(clock=5e-4))
+    assert not selection.verdict.adequate
+    assert {finding.kind for finding in selection.verdict.findings} == {"implausible"}
+    assert all(mode.damping_ratio.flag for mode in selection.headline.modes)
+
+
 @pytest.mark.parametrize(
     ("factor", "kinds"),
     [
