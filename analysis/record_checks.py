@@ -449,8 +449,8 @@ def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
     """
     if torque_nm.size > 1 and np.ptp(torque_nm) == 0.0:
         raise RecordError(
-            f"{path}: coupling_torque_nm is {torque_nm[0]:g} N·m in every sample, so the sensor "
-            "delivered no data; check its connection and record the session again."
+            f"{path}: coupling_torque_nm is {torque_nm[0] + 0.0:g} N·m in every sample, so the "
+            "sensor delivered no data; check its connection and record the session again."
         )
 
 
