@@ -86,14 +86,14 @@ class Minimum:
         Cost, gradient and Hessian at `x`.
     evaluations : int
         Number of evaluations of the problem.
-    second_part : ndarray, shape (k, k)
-        Estimate of half the second part of the Hessian, which Gauss-Newton omits.
+    second_order_part : ndarray, shape (k, k)
+        Estimate of half the second-order part of the Hessian, which Gauss-Newton omits.
     """
 
     x: NDArray[np.float64]
     equations: NormalEquations
     evaluations: int
-    second_part: NDArray[np.float64]
+    second_order_part: NDArray[np.float64]
 
     @property
     def cost(self) -> float:
@@ -184,7 +184,7 @@ def descend(
     *,
     relative_tolerance: float,
     max_evaluations: int = 200,
-    second_part: NDArray[np.float64] | None = None,
+    second_order_part: NDArray[np.float64] | None = None,
     early_stop_limits: tuple[int, float] | None = None,
 ) -> Minimum:
     """Find a local minimum of a sum of squares within bounds, by damped Gauss-Newton steps.
@@ -202,10 +202,10 @@ def descend(
         the cost, or when the step is as small as rounding errors.
     max_evaluations : int
         Largest number of evaluations of `problem`; the best point is then returned.
-    second_part : ndarray, shape (k, k), optional
-        Estimate of the second part of the Hessian for the first step, from a descent on a similar
-        problem. With an estimate from a few points of a frequency response, fits to all points
-        need 39 evaluations instead of 57.
+    second_order_part : ndarray, shape (k, k), optional
+        Estimate of the second-order part of the Hessian for the first step, from a descent on a
+        similar problem. With an estimate from a few points of a frequency response, fits to all
+        points need 39 evaluations instead of 57.
     early_stop_limits : tuple of int and float, optional
         Number of evaluations, and a cost. The descent ends if its cost is still higher after this
         number of evaluations, because other descents explain the data better.
@@ -213,9 +213,9 @@ def descend(
     x = np.clip(start_point, region.lower, region.upper)
     current_equations = problem(x)
     evaluation_count = 1
-    has_second_part = second_part is not None
-    second_part_estimate = (
-        np.zeros_like(current_equations.hessian) if second_part is None else second_part
+    has_second_order_part = second_order_part is not None
+    second_order_part = (
+        np.zeros_like(current_equations.hessian) if second_order_part is None else second_order_part
     )
     damping, damping_growth = _INITIAL_STEP_DAMPING, 2.0
     while evaluation_count < max_evaluations:
@@ -231,15 +231,15 @@ def descend(
             break
         step_limits = region.step_limits(x)
         model_hessian = (
-            current_equations.hessian + second_part_estimate
-            if has_second_part
+            current_equations.hessian + second_order_part
+            if has_second_order_part
             else current_equations.hessian
         )
         step = _compute_step(
             model_hessian, current_equations, is_free_unknown, damping, step_limits
         )
         if step is None:  # not convex
-            has_second_part, model_hessian = False, current_equations.hessian
+            has_second_order_part, model_hessian = False, current_equations.hessian
             step = _compute_step(
                 model_hessian, current_equations, is_free_unknown, damping, step_limits
             )
@@ -259,12 +259,12 @@ def descend(
             gauss_newton_prediction = -float(
                 step @ (2 * current_equations.gradient + current_equations.hessian @ step)
             )
-            second_part_effect = float(step @ second_part_estimate @ step)
-            has_second_part = abs(
-                cost_reduction - (gauss_newton_prediction - second_part_effect)
+            second_order_part_effect = float(step @ second_order_part @ step)
+            has_second_order_part = abs(
+                cost_reduction - (gauss_newton_prediction - second_order_part_effect)
             ) <= abs(cost_reduction - gauss_newton_prediction)
-            second_part_estimate = _update_second_part(
-                second_part_estimate, step, current_equations, next_equations
+            second_order_part = _update_second_order_part(
+                second_order_part, step, current_equations, next_equations
             )
             prediction_ratio = (
                 cost_reduction / predicted_reduction if predicted_reduction > 0 else 0.0
@@ -272,14 +272,14 @@ def descend(
             damping *= max(_SMALLEST_STEP_DAMPING_FACTOR, 1 - (2 * prediction_ratio - 1) ** 3)
             damping_growth = 2.0
             x, current_equations = trial_point, next_equations
-        elif has_second_part:
-            has_second_part = False
+        elif has_second_order_part:
+            has_second_order_part = False
         else:
             damping *= damping_growth
             damping_growth *= 2
             if damping > _LARGEST_STEP_DAMPING:
                 break
-    return Minimum(x, current_equations, evaluation_count, second_part_estimate)
+    return Minimum(x, current_equations, evaluation_count, second_order_part)
 
 
 def _compute_step(
@@ -322,8 +322,8 @@ def _compute_step(
     return step
 
 
-def _update_second_part(
-    second_part_estimate: NDArray[np.float64],
+def _update_second_order_part(
+    second_order_part: NDArray[np.float64],
     step: NDArray[np.float64],
     current_equations: NormalEquations,
     next_equations: NormalEquations,
@@ -332,24 +332,24 @@ def _update_second_part(
     gradient_change = next_equations.gradient - current_equations.gradient
     step_curvature = float(gradient_change @ step)
     if step_curvature <= 0:
-        return second_part_estimate
-    second_part_gradient_change = (
+        return second_order_part
+    second_order_part_gradient_change = (
         gradient_change - (current_equations.hessian + next_equations.hessian) @ step / 2
     )
-    predicted_gradient_change = second_part_estimate @ step
+    predicted_gradient_change = second_order_part @ step
     predicted_change_size = abs(float(step @ predicted_gradient_change))
     if predicted_change_size > 0:  # an estimate from a higher cost may be too large here
         sizing_factor = min(
-            1.0, abs(float(step @ second_part_gradient_change)) / predicted_change_size
+            1.0, abs(float(step @ second_order_part_gradient_change)) / predicted_change_size
         )
-        second_part_estimate, predicted_gradient_change = (
-            sizing_factor * second_part_estimate,
+        second_order_part, predicted_gradient_change = (
+            sizing_factor * second_order_part,
             sizing_factor * predicted_gradient_change,
         )
-    gradient_change_error = second_part_gradient_change - predicted_gradient_change
+    gradient_change_error = second_order_part_gradient_change - predicted_gradient_change
     outer_update = gradient_change_error[:, None] * gradient_change
     return (
-        second_part_estimate
+        second_order_part
         + (outer_update + outer_update.T) / step_curvature
         - (float(gradient_change_error @ step) / step_curvature**2)
         * (gradient_change[:, None] * gradient_change)

@@ -301,7 +301,7 @@ def galerkin_mode_terms(
     length_m, mode_indices = beam.length_m, np.array(mode_numbers) - 1
     point_mass_count = len(deviations.point_masses)
 
-    def with_point_mass_modes(
+    def extend_by_point_masses(
         uniform_beam_array: NDArray[np.float64], diagonal_value: float = 0.0
     ) -> NDArray[np.float64]:
         if not point_mass_count:
@@ -313,26 +313,26 @@ def galerkin_mode_terms(
         return extended_array
 
     density_deviation = basis.total_deviation(deviations.density_deviations)
-    mass = with_point_mass_modes(
+    mass = extend_by_point_masses(
         np.eye(_BASIS_MODE_COUNT)
         + basis.weighted_product_integrals(basis.shapes, density_deviation),
         1.0,
     )
-    mass_arm = with_point_mass_modes(
+    mass_arm = extend_by_point_masses(
         basis.mass_arms
         + basis.shapes @ (basis.quadrature_weights * density_deviation * basis.positions)
     )
     point_mass, point_mass_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
     tension, tension_arm = (
-        with_point_mass_modes(basis.tension_integrals),
-        with_point_mass_modes(basis.tension_arms),
+        extend_by_point_masses(basis.tension_integrals),
+        extend_by_point_masses(basis.tension_arms),
     )
     for point_mass_index, (position, mass_kg) in enumerate(
         deviations.point_masses, start=_BASIS_MODE_COUNT
     ):
         mass_fraction, shape = (
             mass_kg / (beam.density_kg_per_m * length_m),
-            with_point_mass_modes(_basis_shapes_at_position(position).copy()),
+            extend_by_point_masses(_basis_shapes_at_position(position).copy()),
         )
         # All modes beyond the basis act on a point mass as one spring, and move as one mode.
         flexibility_beyond_basis = position**3 / 3 - float(
@@ -345,18 +345,18 @@ def galerkin_mode_terms(
         point_mass_arm += mass_fraction * position * shape
         if deviations.gravity_m_s2:
             outboard_mass_fraction = np.where(basis.positions < position, mass_fraction, 0.0)
-            tension = tension + with_point_mass_modes(
+            tension = tension + extend_by_point_masses(
                 basis.weighted_product_integrals(basis.slopes, outboard_mass_fraction)
             )
             tension_arm = tension_arm + mass_fraction * shape
     # Flexibility of beam and clamp to loads with the shapes of the basis
     bending_moments = basis.curvatures / basis.eigenvalues[:, None] ** 4
     relative_flexibility = 1 / (1 + basis.total_deviation(deviations.stiffness_deviations))
-    beam_flexibility = with_point_mass_modes(
+    beam_flexibility = extend_by_point_masses(
         basis.weighted_product_integrals(bending_moments, relative_flexibility),
         _EIGENVALUE_BEYOND_BASIS**-4.0,
     )
-    root_moments = with_point_mass_modes(
+    root_moments = extend_by_point_masses(
         2 * (-1.0) ** np.arange(_BASIS_MODE_COUNT) / basis.eigenvalues**2
     )
     clamp_flexibility: CoefficientArray = deviations.clamp_compliance * np.outer(
@@ -417,7 +417,7 @@ def galerkin_mode_terms(
         tension=gravity_per_length * modal_coefficients(tension),
         mass_arm=mass_arm @ shapes / sqrt_modal_masses,
         point_mass_arm=point_mass_arm @ shapes / sqrt_modal_masses,
-        external_damping_arm=with_point_mass_modes(basis.mass_arms) @ shapes / sqrt_modal_masses,
+        external_damping_arm=extend_by_point_masses(basis.mass_arms) @ shapes / sqrt_modal_masses,
         tension_arm=gravity_per_length * (tension_arm @ shapes) / sqrt_modal_masses,
         arm_change_per_external_damping=arm_change_per_external_damping
         / sqrt_modal_masses

@@ -10,12 +10,13 @@ law change, the torque changes linearly (`DragExpansion`) with
 * the delay between the channels,
 * the drag itself.
 
-The first four follow from a fit's unknowns. The drag is free: its spectra are projected out like
-those of a free decay. Fits and computations of the drag torque alternate until they agree.
+The first four follow from a fit's unknowns. The drag is a free parameter: its spectra are projected
+out like those of a free decay. Fits and computations of the drag torque alternate until they agree.
 
 Without drag a resonance peak grows without limit as the damping falls. With drag it hardly grows:
 to second order in a pole, the changes of the linear torque and of the torque by drag nearly cancel.
-So the linear torque counts to first order in the poles only. Its change beyond that is subtracted.
+The linear torque is therefore expanded to first order in the poles, too: its change beyond first
+order is subtracted.
 """
 
 from __future__ import annotations
@@ -187,8 +188,8 @@ class DragExpansion:
         """Return the change of one mode's torque with its pole, without the first-order part.
 
         The spectrum has the shape (K,). It is returned with its derivatives by the real and the
-        imaginary part of the pole, shape (2, K). The upper poles of the mode on this beam and on
-        the other beam are in rad/s.
+        imaginary part of the pole, shape (2, K). `own_pole` (of the beam for which the drag was
+        computed) and `other_pole` (of the changed beam) have a positive frequency, in rad/s.
         """
         s, torque_spectrum = self.response.s, self.response.modal_torque(mode_number)
         pole_step = other_pole - own_pole

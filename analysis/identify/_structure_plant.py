@@ -180,7 +180,10 @@ class StructureUnknowns(Unknowns):
     def vector_near(
         self, parameter_values: Mapping[str, float], closest_plant: Plant
     ) -> NDArray[np.float64]:
-        """Return the unknowns for values of the structure's parameters, near `closest_plant`."""
+        """Return the vector of unknowns for values of the structure's parameters.
+
+        The other unknowns (beam, delay and tool inertia) are those of `closest_plant`.
+        """
         own_unknowns = [
             _unknown_of_value(parameter, parameter_values[parameter.name])
             for parameter in self._free_parameters

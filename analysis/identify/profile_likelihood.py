@@ -99,8 +99,11 @@ class LikelihoodProfile:
         order : str
             "alpha" or "lambda".
         """
-        at = candidate.fit.parameters[order]
-        return cls(order, candidate.name, (at,), (0.0,), at, (at,), ORDER_RANGE, True, True, 0.0)
+        fitted = candidate.fit.parameters[order]
+        return cls(
+            order, candidate.name, (fitted,), (0.0,), fitted, (fitted,), ORDER_RANGE,
+            True, True, 0.0,
+        )  # fmt: skip
 
     @property
     def is_computed(self) -> bool:
@@ -531,7 +534,7 @@ class OrderProfiler:
         return min(max(std, 1e-4), 0.25)
 
     def _deviance_root(self, order_value: float) -> float:
-        """Return the square root of the deviance at a computed value of the order."""
+        """Return the square root of the deviance at an order value whose fit is stored."""
         lowest_cost = self.costs[self._minimum_order]
         return math.sqrt(
             max(self._value_count * math.log(self.costs[order_value] / lowest_cost), 0.0)

@@ -53,7 +53,7 @@ noise in 5000 has such a window (of 12 000 records with the noise estimated from
 bins). Such an estimate is uncertain by up to 18 %: with the limits for a noise that is known
 exactly, 4.3 and 2.3, one record in 160 would be loud."""
 
-_COHERENT_BINS: Final = 9
+_COHERENCE_BIN_COUNT: Final = 9
 """Number of neighbouring bins over which the coherence is computed."""
 
 _DRIVEN_POWER_RATIO: Final = 0.1
@@ -222,18 +222,18 @@ def input_relation(
     # The limit keeps a hum, which is no linear dynamics, from dominating.
     limited_residual = residual / np.maximum(np.abs(residual) / _MAX_WHITENED_RESIDUAL, 1.0)
     cross_spectrum = limited_residual * normalized_angle.conj()
-    block_count = residual.size // _COHERENT_BINS
-    first_bins = np.arange(0, block_count * _COHERENT_BINS, _COHERENT_BINS)
+    block_count = residual.size // _COHERENCE_BIN_COUNT
+    first_bins = np.arange(0, block_count * _COHERENCE_BIN_COUNT, _COHERENCE_BIN_COUNT)
 
     def block_sums(bin_values: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the sum of values over each group of `_COHERENT_BINS` neighbouring bins."""
+        """Return the sum of values over each group of `_COHERENCE_BIN_COUNT` neighbouring bins."""
         sums_per_block: NDArray[np.complex128] = np.add.reduceat(
-            bin_values[: block_count * _COHERENT_BINS], first_bins
+            bin_values[: block_count * _COHERENCE_BIN_COUNT], first_bins
         )
         return sums_per_block
 
     block_angle_power = block_sums(normalized_angle * normalized_angle.conj()).real
-    driven_blocks = np.flatnonzero(block_angle_power > _DRIVEN_POWER_RATIO * _COHERENT_BINS)
+    driven_blocks = np.flatnonzero(block_angle_power > _DRIVEN_POWER_RATIO * _COHERENCE_BIN_COUNT)
     largest_cross_power = (
         block_sums(limited_residual * limited_residual.conj()).real[driven_blocks]
         * block_angle_power[driven_blocks]
@@ -242,7 +242,7 @@ def input_relation(
         largest_cross_power, np.finfo(float).tiny
     )
     # Under chance (1 - coherence)^(m - 1) is uniform, whatever the angle.
-    ln_chance = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
+    ln_chance = -(_COHERENCE_BIN_COUNT - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
     least_likely_index = int(np.argmax(ln_chance))
     is_locally_related = bool(
         ln_chance[least_likely_index] > largest_deviate_limit(driven_blocks.size)
@@ -265,7 +265,7 @@ def input_relation(
     return InputRelation(
         coherence=float(coherence[least_likely_index]),
         at_hz=float(
-            frequency_hz[first_bins[driven_blocks[least_likely_index]] + _COHERENT_BINS // 2]
+            frequency_hz[first_bins[driven_blocks[least_likely_index]] + _COHERENCE_BIN_COUNT // 2]
         ),
         local=is_locally_related,
         deviate=summed_deviate,

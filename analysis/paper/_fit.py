@@ -333,7 +333,7 @@ def _refine(frf_problem: _FrfProblem, rough_minimum: Minimum, bounds: ConstantBo
         rough_minimum.x,
         bounds,
         relative_tolerance=_REFINED_COST_TOLERANCE,
-        second_part=rough_minimum.second_part,
+        second_order_part=rough_minimum.second_order_part,
     )
 
 

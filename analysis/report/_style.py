@@ -296,7 +296,7 @@ def _draw_in_two_processes(
     formats: Collection[FigureFormat],
     on_step: Callable[[str], None],
 ) -> dict[str, ImageByFormat]:
-    """Return the image files of each figure by its name; a copy of the process draws half."""
+    """Return the image files of each figure by its name; a forked process draws half of them."""
     own_illustrations, copied_illustrations = illustrations[::2], illustrations[1::2]
     images: dict[str, ImageByFormat] = {}
     background_drawing = (

@@ -5,8 +5,8 @@ mass ratio ``mu = m s² / (L EI p)``, the tip's condition ``EI c y''' = m s² y`
 
     G = -(EI/L) c (F + mu U) / (1 - mu F),    U = 2 z² sin z sinh z / (1 + cos z cosh z)
 
-F as in `rigd.beam._model`. A clamp that turns by kappa per torque on the beam's root turns it into
-``G / (1 + kappa G)``.
+F as in `rigd.beam._model`. With a clamp that turns by kappa per torque on the
+beam's root, the transfer function is ``G / (1 + kappa G)``.
 
 F and U are functions of q alone; ``q d/dq`` of them needs one more, ``B = z (cos z sinh z +
 sin z cosh z) / (1 + cos z cosh z)``::

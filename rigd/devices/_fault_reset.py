@@ -58,15 +58,15 @@ def reset_drive(rig: RigParameters, target: ActuationTarget | None = None) -> st
             "with its manufacturer's tool."
         )
     try:
-        fault = drive.reset_fault()
+        cleared_fault = drive.reset_fault()
     finally:
         drive.close()
-    if fault is None:
+    if cleared_fault is None:
         return (
             "The drive is not in fault, so there is nothing to reset. Its statusword shows it off "
             "and it gets ready to switch on: the next session can be started."
         )
     return (
-        f"The drive was in fault: {fault}. The fault is reset. Its statusword shows it off and it "
-        "gets ready to switch on: the next session can be started."
+        f"The drive was in fault: {cleared_fault}. The fault is reset. Its statusword shows it off "
+        "and it gets ready to switch on: the next session can be started."
     )

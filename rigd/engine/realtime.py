@@ -152,7 +152,7 @@ class RaisedPriority:
             return {"scheduling": f"{niceness_result} (SCHED_RR {scheduling_result})"}
         return {"scheduling": scheduling_result}
 
-    def raise_new_threads(self) -> None:
+    def raise_priority_of_new_threads(self) -> None:
         """Give the threads that were started since `request_priority` the priority of the process.
 
         All threads need it, because they compete for one interpreter lock.
@@ -168,21 +168,21 @@ class RaisedPriority:
         if self._apply_priority is None:
             return
         self._apply_priority = self._restore_thread_priority
-        self.raise_new_threads()
+        self.raise_priority_of_new_threads()
         self._apply_priority = None
 
     def _raise_to_realtime(self) -> str:
         """Set the real-time priority SCHED_RR for all threads, and return its description."""
         self._set_realtime_priority(0)
         self._apply_priority = self._set_realtime_priority
-        self.raise_new_threads()
+        self.raise_priority_of_new_threads()
         return f"SCHED_RR {self._priority}"
 
     def _raise_by_niceness(self) -> str:
         """Set the niceness `SUPERVISION_NICENESS` for all threads, and return its description."""
         self._set_niceness(0)
         self._apply_priority = self._set_niceness
-        self.raise_new_threads()
+        self.raise_priority_of_new_threads()
         return f"nice {SUPERVISION_NICENESS}"
 
     def _set_realtime_priority(self, thread_id: int) -> None:

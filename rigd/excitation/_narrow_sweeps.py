@@ -105,7 +105,7 @@ class _HeadlineMode(BaseModel):
 
     @property
     def entry(self) -> _ModeEntry:
-        """Frequency, damping ratio and standard deviation of the mode, as for a mode of one fit."""
+        """Pooled frequency and damping ratio with standard deviations, like those of one fit."""
         return _ModeEntry(
             frequency_hz=self.frequency_hz.value,
             damping_ratio=self.damping_ratio.value or None,

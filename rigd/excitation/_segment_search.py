@@ -152,10 +152,10 @@ class SegmentSearch:
         # The torque of the remaining vibration acts on the motor that holds, and on the sensor.
         torque_nm, slope_rad = record.ringing_motion
         zero_channel = np.zeros_like(torque_nm)
-        ringing_channels = np.stack(
+        vibration_channels = np.stack(
             [zero_channel, zero_channel, zero_channel, torque_nm, torque_nm, slope_rad]
         )
-        self.ringing_fractions = ringing_channels / self.limits[:, None]
+        self.vibration_fractions = vibration_channels / self.limits[:, None]
         self.line_hz, self.line_amplitudes_rad = steady_sines(
             estimate, self.modes, plant, self.limits
         )
@@ -183,7 +183,7 @@ class SegmentSearch:
             self.mixture.weights @ record.nuisance_projection @ record.future_derivatives
         )
         self._continued_drives: dict[float, ContinuedDrive] = {}
-        self.tip_slope = self.ringing_fractions[-1, :: self.model.ticks_per_model_sample][
+        self.tip_slope = self.vibration_fractions[-1, :: self.model.ticks_per_model_sample][
             : self.sample_count
         ]
 
@@ -220,7 +220,7 @@ class SegmentSearch:
             duration_s,
             (),
             (),
-            self.ringing_fractions[
+            self.vibration_fractions[
                 :, : self.to_ticks(duration_s + _CHECKED_SETTLING_S) : _LIMIT_CHECK_TICKS
             ],
             self.rows_if_held,
@@ -408,15 +408,15 @@ class SegmentSearch:
         phase_rad = 2 * pi * phase_index / _PHASE_COUNT
         sine_factor, cosine_factor = float(np.cos(phase_rad)), float(np.sin(phase_rad))
         first_sweep, second_sweep = sweep_pair
-        ringing_channels = self.ringing_fractions[
+        vibration_channels = self.vibration_fractions[
             :, : first_sweep.limit_fractions.shape[1] : _LIMIT_CHECK_TICKS
         ]
         unit_channels = (
             sine_factor * first_sweep.limit_fractions[:, ::_LIMIT_CHECK_TICKS]
             + cosine_factor * second_sweep.limit_fractions[:, ::_LIMIT_CHECK_TICKS]
         )
-        base_channels = ringing_channels + amplitude_fraction * (
-            base_candidate.limit_fractions - ringing_channels
+        base_channels = vibration_channels + amplitude_fraction * (
+            base_candidate.limit_fractions - vibration_channels
         )
         amplitude_rad = largest_factor(base_channels, unit_channels)
         tip_slope_fractions = self.tip_slope + amplitude_fraction * (
@@ -542,9 +542,9 @@ class SegmentSearch:
         estimate, quantities = self.estimate, self.quantities
         segment_samples = self.to_model_samples(chosen_candidate.duration_s)
         segment_channels = chosen_candidate.weighted_sum("limit_fractions")
-        ringing_channels = self.ringing_fractions[:, : segment_channels.shape[1]]
+        vibration_channels = self.vibration_fractions[:, : segment_channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
-        amplitude_fraction = min(1.0, largest_factor(ringing_channels, segment_channels))
+        amplitude_fraction = min(1.0, largest_factor(vibration_channels, segment_channels))
         present_covariance = covariance_of(self.record.information_after(None, 0), estimate)
         later_covariance = covariance_of(
             self.record.information_after(
@@ -564,7 +564,7 @@ class SegmentSearch:
             forecast=self.forecast(time_left_s),
             fraction_of_limits=MAX_PLANNED_LIMIT_FRACTION
             * self.limit_fraction
-            * float(np.abs(ringing_channels + amplitude_fraction * segment_channels).max()),
+            * float(np.abs(vibration_channels + amplitude_fraction * segment_channels).max()),
         )
 
     def _mixture_time_s(self) -> float:

@@ -525,7 +525,10 @@ class ExcitationPlanner:
         self._writer.append(reference_rad)
 
     def _reference_rad(self, held_ticks: int) -> RealArray:
-        """Return the reference angle (n,) at each tick of the record up to the last segment."""
+        """Return the reference angle at each tick of the record so far, shape (n,).
+
+        The record ends with the last segment and `held_ticks` ticks of rest.
+        """
         reference_rad = np.zeros(self._writer.ticks + held_ticks)
         for interval in self._intervals:
             reference_rad[

@@ -223,7 +223,7 @@ class Rig:
                 "the motor to mid-travel and run rigd zero."
             )
         if self._raised_priority is not None:
-            self._raised_priority.raise_new_threads()
+            self._raised_priority.raise_priority_of_new_threads()
         _reset_session_fields(group.channels.shared_state)
         group.channels.discard_records()
         session_run = SessionSupervisor(
@@ -322,7 +322,7 @@ class Rig:
         group = self._connected_group()
         shared_state = group.channels.shared_state
         if self._raised_priority is not None:
-            self._raised_priority.raise_new_threads()
+            self._raised_priority.raise_priority_of_new_threads()
         _reset_session_fields(shared_state)
 
         def request_stop() -> None:

@@ -201,33 +201,35 @@ def _has_footer(file_data: memoryview) -> bool:
 
 
 def _locate_record(
-    file_data: Buffer, record_start: int, location_text: str
+    file_data: Buffer, record_offset: int, location_text: str
 ) -> tuple[int, int, int]:
-    """Return the opcode of the record at byte `record_start`, and start and end of its content.
+    """Return the opcode of the record at byte `record_offset`, and start and end of its content.
 
     `location_text` ends the error message for a truncated record.
     """
-    content_start = record_start + RECORD_HEAD_FORMAT.size
+    content_start = record_offset + RECORD_HEAD_FORMAT.size
     if content_start > len(file_data):
-        raise _truncated_record_error(record_start, location_text)
-    opcode, content_length = RECORD_HEAD_FORMAT.unpack_from(file_data, record_start)
+        raise _truncated_record_error(record_offset, location_text)
+    opcode, content_length = RECORD_HEAD_FORMAT.unpack_from(file_data, record_offset)
     if opcode == 0:
-        raise _missing_record_error(record_start, location_text)
+        raise _missing_record_error(record_offset, location_text)
     content_end = content_start + content_length
     if content_end > len(file_data):
-        raise _truncated_record_error(record_start, location_text)
+        raise _truncated_record_error(record_offset, location_text)
     return opcode, content_start, content_end
 
 
-def _truncated_record_error(record_start: int, location_text: str) -> McapDamageError:
+def _truncated_record_error(record_offset: int, location_text: str) -> McapDamageError:
     """Return the error for a file that ends within a record."""
-    return McapDamageError(f"ends in the middle of a record, at byte {record_start}{location_text}")
+    return McapDamageError(
+        f"ends in the middle of a record, at byte {record_offset}{location_text}"
+    )
 
 
-def _missing_record_error(record_start: int, location_text: str) -> McapDamageError:
+def _missing_record_error(record_offset: int, location_text: str) -> McapDamageError:
     """Return the error for a position at which a record must begin but does not."""
     return McapDamageError(
-        f"has no record where one must be, at byte {record_start}{location_text}"
+        f"has no record where one must be, at byte {record_offset}{location_text}"
     )
 
 
@@ -262,19 +264,19 @@ class _ContainerReader:
         data, contents = self._data, self.contents
         record_end = len(MAGIC)
         while record_end < len(data):
-            record_start = record_end
-            opcode, content_start, record_end = _locate_record(data, record_start, "")
+            record_offset = record_end
+            opcode, content_start, record_end = _locate_record(data, record_offset, "")
             self._budget.count_steps(1)
             if opcode == Opcode.CHUNK:
-                self._read_chunk(data[content_start:record_end], record_start)
+                self._read_chunk(data[content_start:record_end], record_offset)
                 if on_progress is not None:
                     on_progress(record_end / len(data))
             elif opcode == Opcode.MESSAGE:
-                record_end = self._read_unchunked_messages(record_start, record_end)
+                record_end = self._read_unchunked_messages(record_offset, record_end)
                 if on_progress is not None:
                     on_progress(record_end / len(data))
             elif opcode == Opcode.DATA_END:
-                self._check_data_end(data[content_start:record_end], record_start)
+                self._check_data_end(data[content_start:record_end], record_offset)
                 contents.intact_bytes = record_end
                 self._check_summary(record_end)
                 contents.intact_bytes = len(data)
@@ -284,7 +286,7 @@ class _ContainerReader:
             else:
                 try:
                     self._read_declaration(
-                        opcode, data[content_start:record_end], f" at byte {record_start}"
+                        opcode, data[content_start:record_end], f" at byte {record_offset}"
                     )
                 except McapDamageError as error:
                     if not self._is_salvage:
@@ -514,21 +516,21 @@ class _ContainerReader:
         """
         record_end = 0
         while record_end < len(record_bytes):
-            record_start = record_end
+            record_offset = record_end
             record_end, message_count = self._read_messages(
-                record_bytes, record_start, len(record_bytes), chunk_position, location_text
+                record_bytes, record_offset, len(record_bytes), chunk_position, location_text
             )
             if message_count:
                 continue
-            if record_start + RECORD_HEAD_FORMAT.size > len(record_bytes):
-                return record_start
-            opcode, length = RECORD_HEAD_FORMAT.unpack_from(record_bytes, record_start)
+            if record_offset + RECORD_HEAD_FORMAT.size > len(record_bytes):
+                return record_offset
+            opcode, length = RECORD_HEAD_FORMAT.unpack_from(record_bytes, record_offset)
             if opcode == 0:
-                raise _missing_record_error(buffer_offset + record_start, location_text)
-            content_start = record_start + RECORD_HEAD_FORMAT.size
+                raise _missing_record_error(buffer_offset + record_offset, location_text)
+            content_start = record_offset + RECORD_HEAD_FORMAT.size
             record_end = content_start + length
             if record_end > len(record_bytes):
-                return record_start
+                return record_offset
             self._budget.count_steps(1)
             if opcode == Opcode.MESSAGE:
                 raise McapDamageError(f"has a message that is too short{location_text}")
@@ -609,12 +611,14 @@ class _ContainerReader:
         self._budget.count_steps(run_count)
         return run_start, message_count
 
-    def _check_data_end(self, record_content: memoryview, record_start: int) -> None:
+    def _check_data_end(self, record_content: memoryview, record_offset: int) -> None:
         """Verify the checksum over the data section, which `record_content` states."""
         if len(record_content) < 4:
-            raise McapDamageError(f"has a malformed end of its data section at byte {record_start}")
+            raise McapDamageError(
+                f"has a malformed end of its data section at byte {record_offset}"
+            )
         (crc,) = struct.unpack_from("<I", record_content)
-        if crc != 0 and crc != self._crc_of_range(self._released_end, record_start, self._crc):
+        if crc != 0 and crc != self._crc_of_range(self._released_end, record_offset, self._crc):
             raise McapDamageError("has a wrong checksum over its data section")
         self.contents.has_correct_checksum = crc != 0
 

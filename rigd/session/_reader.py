@@ -358,12 +358,12 @@ class _UndecodedLog:
                     )
                 continue
             remaining_count = MAX_EVENTS - len(self._stored_messages)
-            for record_start in range(
+            for record_offset in range(
                 run_start,
                 run_start + message_size * min(message_count, remaining_count),
                 message_size,
             ):
-                log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, record_start)[4])
+                log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, record_offset)[4])
                 data_length = message_size - MESSAGE_HEAD_FORMAT.size
                 if data_length > MAX_EVENT_BYTES:
                     self._stored_messages.append((channel, log_time, data_length))
@@ -373,7 +373,7 @@ class _UndecodedLog:
                     self._stored_bytes += data_length
                     message_data = bytes(
                         records[
-                            record_start + MESSAGE_HEAD_FORMAT.size : record_start + message_size
+                            record_offset + MESSAGE_HEAD_FORMAT.size : record_offset + message_size
                         ]
                     )
                     self._stored_messages.append((channel, log_time, message_data))

@@ -81,8 +81,9 @@ class AnyForceLikelihood:
 class AnyForceEstimator:
     """Estimator of the touch position for an arbitrary force over time.
 
-    The kernels have two time steps per sample; every `position_stride`-th of their positions is
-    compared, in windows of at most `sample_count` samples.
+    The torque responses to an impulse (kernels) have two time steps per sample. Every
+    `position_stride`-th of the positions on the beam for which there is a kernel is compared, in
+    windows of at most `sample_count` samples.
     """
 
     __slots__ = ("_force_effects", "_x_m")

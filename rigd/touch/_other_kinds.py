@@ -202,8 +202,9 @@ def explain_by_two_obstacles(
 ) -> tuple[Explanation | None, RealArray]:
     """Return the explanation by two obstacles, and possible positions in m of the first one.
 
-    The explanation is None if one obstacle explains the record about as well. With the first of
-    two obstacles at one of the positions, two explain the first samples as well as one.
+    The explanation is None if one obstacle explains the record about as well. At each of the
+    positions of the first obstacle, the pair explains the first samples as well as a single
+    obstacle does.
     """
     two_contacts = obstacle_fit.two_obstacle_contact()
     parameter_ranges = two_contacts.parameter_ranges(obstacle_fit.parameter_ranges(3))

@@ -268,7 +268,7 @@ def _number_in_range(
 def _session_notes(
     session: Session, touch_documents: Sequence[Mapping[str, Any]]
 ) -> Iterator[Note]:
-    """Yield the notes for the log of the window: events, touches and outcome of a session."""
+    """Yield the notes for the log panel of the viewer: events, touches and outcome of a session."""
     for session_event in session.events:
         yield Note(session_event.t_ns, session_event.level, session_event.message)
     for touch in touch_documents:

@@ -273,7 +273,7 @@ class Library:
         return self._session_path(request.match_info["id"])
 
     def _session_path(self, session_name: str) -> Path:
-        """Return the file of the session with a name.
+        """Return the file of the session with the given name.
 
         Raise `HTTPNotFound` if the folder has no regular file of that name.
         """

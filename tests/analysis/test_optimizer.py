@@ -126,12 +126,16 @@ def test_large_residuals_are_descended_in_fewer_steps_than_gauss_newtons():
     plain = scipy.optimize.least_squares(
         stacked, rough.x, slopes_of, xtol=1e-15, ftol=1e-14, gtol=1e-15
     )
-    near = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, second_part=np.zeros((2, 2)))
+    near = descend(
+        misfit, rough.x, FREE, relative_tolerance=1e-14, second_order_part=np.zeros((2, 2))
+    )
     assert near.cost > 1.0
     assert near.cost <= 2 * plain.cost * (1 + 1e-13)
     np.testing.assert_allclose(near.x, plain.x, rtol=1e-6)
     assert near.evaluations <= plain.nfev / 2
-    again = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, second_part=near.second_part)
+    again = descend(
+        misfit, rough.x, FREE, relative_tolerance=1e-14, second_order_part=near.second_order_part
+    )
     np.testing.assert_allclose(again.x, near.x, rtol=1e-6)
     assert again.evaluations < near.evaluations
 
@@ -139,20 +143,20 @@ def test_large_residuals_are_descended_in_fewer_steps_than_gauss_newtons():
 def test_second_order_term_matches_second_derivatives():
     near = descend(
         misfit, np.array([0.3, 2.4]), FREE, relative_tolerance=1e-16,
-        second_part=np.zeros((2, 2)),
+        second_order_part=np.zeros((2, 2)),
     )  # fmt: skip
     gradients = [
         (misfit(near.x + h).gradient - misfit(near.x - h).gradient) / 2e-5 for h in 1e-5 * np.eye(2)
     ]
     beyond = np.array(gradients) - misfit(near.x).hessian
     assert np.abs(beyond).max() > 0.05 * np.abs(misfit(near.x).hessian).max()
-    np.testing.assert_allclose(near.second_part, beyond, atol=0.1 * np.abs(beyond).max())
+    np.testing.assert_allclose(near.second_order_part, beyond, atol=0.1 * np.abs(beyond).max())
 
 
 def test_wrong_second_order_term_does_no_harm():
     found = descend(
         rosenbrock, np.array([1.2, 1.3]), FREE, relative_tolerance=1e-14,
-        second_part=np.array([[-900.0, 0.0], [0.0, 300.0]]),
+        second_order_part=np.array([[-900.0, 0.0], [0.0, 300.0]]),
     )  # fmt: skip
     np.testing.assert_allclose(found.x, 1.0, atol=1e-6)
 

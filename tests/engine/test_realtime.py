@@ -188,7 +188,7 @@ told["obtained"], told["with"] = raised_priority.request_priority(), state()
 wait = threading.Event()
 thread = threading.Thread(target=wait.wait, daemon=True)
 thread.start()
-raised_priority.raise_new_threads()
+raised_priority.raise_priority_of_new_threads()
 told["thread"] = state(thread.native_id)
 told["child"] = as_child()
 if {with_child}:

@@ -360,13 +360,13 @@ class _SuitabilityCheck:
             return SuitabilityFinding(object_text, found_text, wanted_text, grade, consequence)
 
         if required_object.access & (ObjectAccess.SENT_IN_TPDO | ObjectAccess.RECEIVED_IN_RPDO):
-            mapping_obstacle = self._describe_mapping_obstacle(eds_entry)
-            if mapping_obstacle and required_object.acceptance_name:
+            mapping_refusal = self._describe_unmappable_object(eds_entry)
+            if mapping_refusal and required_object.acceptance_name:
                 return self._acceptable_absence_finding(
-                    required_object, object_text, f"{found_text}, {mapping_obstacle}", wanted_text
+                    required_object, object_text, f"{found_text}, {mapping_refusal}", wanted_text
                 )
-            if mapping_obstacle:
-                return doubt_or_refusal(f"{mapping_obstacle}. {required_object.consequence}")
+            if mapping_refusal:
+                return doubt_or_refusal(f"{mapping_refusal}. {required_object.consequence}")
         if ObjectAccess.WRITTEN_BY_SDO in required_object.access and not eds_entry.is_writable:
             return self._read_only_object_finding(
                 required_object, eds_entry, found_text, wanted_value
@@ -457,7 +457,7 @@ class _SuitabilityCheck:
             object_text, found_text, wanted_text, Grade.REFUSED, _capitalise(consequence)
         )
 
-    def _describe_mapping_obstacle(self, eds_entry: EdsEntry) -> str:
+    def _describe_unmappable_object(self, eds_entry: EdsEntry) -> str:
         """Return why an object cannot be mapped into its PDO, or an empty text if it can."""
         required_length_bit = _LENGTH_BIT_BY_MAPPED_INDEX[eds_entry.index]
         if eds_entry.length_bit not in (None, required_length_bit):
