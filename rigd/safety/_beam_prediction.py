@@ -96,12 +96,13 @@ class BeamPrediction:
         self._state_size = state_size
         self._gain = observer_gain[:state_size]
         self._matrix_product = np.asfortranarray(update_matrix).dot
-        self._vectors = tuple(np.zeros((2, state_size + 2)))
+        # Input and output in turn; the last element is not part of an output.
+        self._vectors = tuple((vector, vector[:-1]) for vector in np.zeros((2, state_size + 2)))
         self.reset(0.0)
 
     def reset(self, angle_rad: float) -> None:
         """Start again with the beam at rest at an angle."""
-        for state_vector in self._vectors:
+        for state_vector, _ in self._vectors:
             state_vector[:] = 0.0
         self._start_rad = angle_rad
 
@@ -114,14 +115,15 @@ class BeamPrediction:
             Measured angle and coupling torque.
         """
         state_size = self._state_size
-        input_, output_state = self._vectors
+        present_vectors, next_vectors = self._vectors
+        input_, output = present_vectors[0], next_vectors[1]
         input_[state_size] = angle_rad - self._start_rad
         input_[state_size + 1] = torque_nm
-        self._matrix_product(input_, output_state[:-1])
-        self._vectors = output_state, input_
-        return float(output_state[state_size])
+        self._matrix_product(input_, output)
+        self._vectors = next_vectors, present_vectors
+        return output.item(state_size)
 
     def skip(self, angle_rad: float) -> None:
         """Advance the prediction by a tick without a measured torque."""
         prediction_error_nm = self.step(angle_rad, 0.0)
-        self._vectors[0][: self._state_size] -= self._gain * prediction_error_nm
+        self._vectors[0][0][: self._state_size] -= self._gain * prediction_error_nm

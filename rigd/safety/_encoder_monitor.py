@@ -71,6 +71,11 @@ _REPEAT_WINDOW_TICKS = 32
 """Ticks within which repeated readings are counted."""
 _MIN_REPEAT_CHECK_ENCODER_STEPS = 3.5
 """Smallest movement per tick before and after a repeated reading, in encoder steps."""
+_SPEED_DIFFERENCE_WEIGHTS = tuple(
+    (j, (1 if j in (2, SPEED_TICKS + 2) else 2) / (2 * SPEED_TICKS * WINDOW_TICKS))
+    for j in range(2, SPEED_TICKS + 3)
+)
+"""Index from the end of the torques' sums, and weight of the mean torque over the window there."""
 
 
 class EncoderMonitor:
@@ -110,7 +115,6 @@ class EncoderMonitor:
         "_coupling_nm2",
         "_decay",
         "_delayed_commands_nm",
-        "_error_sums",
         "_half_period_ticks",
         "_inertia_kg_m2",
         "_irregular_ticks",
@@ -123,10 +127,10 @@ class EncoderMonitor:
         "_resolution_rad",
         "_scale_monitor",
         "_standstill_count",
+        "_sums",
         "_test_start_rad",
         "_test_step_nm",
         "_tick_count",
-        "_torque_history",
         "_windows",
         "test_nm",
         "tests",
@@ -164,9 +168,9 @@ class EncoderMonitor:
         )
         self._decay = 1.0 / (_RMS_TIME_CONSTANT_S * rate_hz)
         history_ticks = window_ticks[-1] + 2
-        # Cumulative sums: the difference of two gives the mean over a window.
-        self._torque_history: deque[tuple[float, float]] = deque(maxlen=history_ticks)
-        self._error_sums: deque[float] = deque(maxlen=history_ticks)
+        # Sums of net torque, motor torque and error of the predicted coupling torque since the
+        # start: the difference of two gives the mean over a window.
+        self._sums: deque[tuple[float, float, float]] = deque(maxlen=history_ticks)
         self._angles: deque[float] = deque(maxlen=SPEED_TICKS + WINDOW_TICKS + 1)
         self._repeat_ticks: deque[int] = deque(maxlen=_FAULTY_REPEAT_COUNT)
         self._delayed_commands_nm: deque[float] = deque(maxlen=command_delay_ticks)
@@ -190,15 +194,13 @@ class EncoderMonitor:
             self._prediction.reset(angle_rad)
         self._noise_nm = torque_noise_nm
         for history in (
-            self._torque_history,
-            self._error_sums,
+            self._sums,
             self._angles,
             self._repeat_ticks,
             self._delayed_commands_nm,
         ):
             history.clear()
-        self._torque_history.extend([(0.0, 0.0)] * 2)
-        self._error_sums.append(0.0)
+        self._sums.extend([(0.0, 0.0, 0.0)] * 2)
         self._angles.append(angle_rad)
         self._delayed_commands_nm.extend([0.0] * (self._delayed_commands_nm.maxlen or 0))
         self._coupling_nm2 = 0.0
@@ -228,21 +230,18 @@ class EncoderMonitor:
         Violation or None
             Evidence of a failed encoder, or None. With a violation `test_nm` must be ignored.
         """
-        beam_prediction = self._prediction
         pending_commands_nm = self._delayed_commands_nm
         pending_commands_nm.append(sent_torque_nm)
         motor_torque_nm = pending_commands_nm[0]
         if not is_fresh:
             self.skip(1, angle_rad)
             return None
-        prediction_error_nm = (
-            0.0 if beam_prediction is None else beam_prediction.step(angle_rad, coupling_nm)
+        net_sum, motor_sum, error_sum = self._sums[-1]
+        if self._prediction is not None:
+            error_sum += self._prediction.step(angle_rad, coupling_nm)
+        self._sums.append(
+            (net_sum + motor_torque_nm - coupling_nm, motor_sum + motor_torque_nm, error_sum)
         )
-        net_sum, motor_sum = self._torque_history[-1]
-        self._torque_history.append(
-            (net_sum + motor_torque_nm - coupling_nm, motor_sum + motor_torque_nm)
-        )
-        self._error_sums.append(self._error_sums[-1] + prediction_error_nm)
         self._coupling_nm2 += self._decay * (coupling_nm * coupling_nm - self._coupling_nm2)
         self._tick_count += 1
         angles = self._angles
@@ -295,13 +294,11 @@ class EncoderMonitor:
         angle_rad
             Last angle that was read.
         """
-        net_sum, motor_sum = self._torque_history[-1]
-        error_sum = self._error_sums[-1]
+        last_sums = self._sums[-1]
         for _ in range(skipped_ticks):
             if self._prediction is not None:
                 self._prediction.skip(angle_rad)
-            self._torque_history.append((net_sum, motor_sum))
-            self._error_sums.append(error_sum)
+            self._sums.append(last_sums)
         self._standstill_count = 0
         self._irregular_ticks = self._angles.maxlen or 0
 
@@ -342,7 +339,7 @@ class EncoderMonitor:
             or not movement_rad
         ):
             return None
-        window_ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
+        window_ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._sums) - 2)
         net_sum, motor_sum = self._torque_sums(window_ticks)
         momentum_per_tick = (
             _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(movement_rad) / SPEED_TICKS
@@ -377,8 +374,8 @@ class EncoderMonitor:
 
     def _compare_coupling_torque(self, window_ticks: int) -> None:
         """Start a test of the encoder if the beam's torque differs from its prediction."""
-        error_sums, noise_nm = self._error_sums, self._noise_nm
-        prediction_error_nm = (error_sums[-1] - error_sums[-1 - window_ticks]) / window_ticks
+        sums, noise_nm = self._sums, self._noise_nm
+        prediction_error_nm = (sums[-1][2] - sums[-1 - window_ticks][2]) / window_ticks
         vibration_rms_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
         significant_error_nm = max(
             _MIN_SIGNIFICANT_FRACTION * self._breakaway_nm,
@@ -427,9 +424,9 @@ class EncoderMonitor:
 
     def _compare_scales(self, scale_monitor: ScaleMonitor) -> Violation | None:
         """Pass acceleration and net torque of the last window to the scale monitor."""
-        angles, torque_history = self._angles, self._torque_history
+        angles, sums = self._angles, self._sums
         n = WINDOW_TICKS
-        if len(angles) < n + SPEED_TICKS + 1 or len(torque_history) < n + SPEED_TICKS + 3:
+        if len(angles) < n + SPEED_TICKS + 1 or len(sums) < n + SPEED_TICKS + 3:
             return None
         recent_movement_rad = angles[-1] - angles[-1 - SPEED_TICKS]
         previous_movement_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
@@ -441,21 +438,11 @@ class EncoderMonitor:
             return None
         # Weighted like the difference of two mean speeds, the torques match the acceleration.
         net_torque_nm = motor_torque_nm = 0.0
-        for j in range(1, SPEED_TICKS + 1):
-            for window_end in (torque_history[-1 - j], torque_history[-2 - j]):
-                net_torque_nm, motor_torque_nm = (
-                    net_torque_nm + window_end[0],
-                    motor_torque_nm + window_end[1],
-                )
-            for window_start in (torque_history[-1 - j - n], torque_history[-2 - j - n]):
-                net_torque_nm, motor_torque_nm = (
-                    net_torque_nm - window_start[0],
-                    motor_torque_nm - window_start[1],
-                )
-        net_torque_nm, motor_torque_nm = (
-            net_torque_nm / (2 * SPEED_TICKS * n),
-            motor_torque_nm / (2 * SPEED_TICKS * n),
-        )
+        for j, weight in _SPEED_DIFFERENCE_WEIGHTS:
+            end_net_sum, end_motor_sum, _ = sums[-j]
+            start_net_sum, start_motor_sum, _ = sums[-j - n]
+            net_torque_nm += weight * (end_net_sum - start_net_sum)
+            motor_torque_nm += weight * (end_motor_sum - start_motor_sum)
         acceleration_rad_s2 = (
             (recent_movement_rad - previous_movement_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
         )
@@ -471,8 +458,8 @@ class EncoderMonitor:
 
         The present tick is excluded: its torque turns the shaft from now on.
         """
-        net_sum, motor_sum = self._torque_history[-2]
-        earlier_net_sum, earlier_motor_sum = self._torque_history[-2 - window_ticks]
+        net_sum, motor_sum, _ = self._sums[-2]
+        earlier_net_sum, earlier_motor_sum, _ = self._sums[-2 - window_ticks]
         return net_sum - earlier_net_sum, motor_sum - earlier_motor_sum
 
     def _end_encoder_test(self) -> None:

@@ -40,6 +40,8 @@ _MIN_SIGNIFICANT_STDS = 4.0
 """Standard deviations by which the ratio has to exceed its limit to be a fault."""
 _WINDOWS_PER_CHECK = 8
 """Number of windows from one check of the ratio to the next."""
+_NEW_WINDOW_WEIGHTS = _FORGETTING_FACTOR ** np.arange(_WINDOWS_PER_CHECK - 1, -1, -1)
+"""Weights of the windows since the last check."""
 
 
 class ScaleMonitor:
@@ -55,7 +57,7 @@ class ScaleMonitor:
         Ratio, or inverse ratio, above which there is a fault; infinite to check nothing.
     """
 
-    __slots__ = ("_inertia_kg_m2", "_limit", "_moments", "_windows")
+    __slots__ = ("_inertia_kg_m2", "_limit", "_moments", "_new_windows", "_windows")
 
     def __init__(self, inertia_kg_m2: float, ratio_limit: float) -> None:
         self._inertia_kg_m2 = inertia_kg_m2
@@ -67,6 +69,8 @@ class ScaleMonitor:
         # Sums of the products of [J θ'', Γ, sign(θ'), θ', u - Γ].
         self._moments = np.zeros((5, 5))
         self._windows = 0
+        # Windows since the last check, which are not in the sums yet.
+        self._new_windows: list[tuple[float, float, float, float, float]] = []
 
     def add_window(
         self,
@@ -90,7 +94,8 @@ class ScaleMonitor:
             Violation if the ratio is beyond its limit.
         """
         inertial_torque_nm = self._inertia_kg_m2 * acceleration_rad_s2
-        window_row = np.array(
+        new_windows = self._new_windows
+        new_windows.append(
             (
                 inertial_torque_nm,
                 coupling_nm,
@@ -99,17 +104,20 @@ class ScaleMonitor:
                 net_torque_nm,
             )
         )
-        self._moments *= _FORGETTING_FACTOR
-        self._moments += window_row[:, None] * window_row
-        self._windows += 1
-        if self._windows < _MIN_WINDOW_COUNT or self._windows % _WINDOWS_PER_CHECK:
+        if len(new_windows) < _WINDOWS_PER_CHECK:
             return None
-        return self._check_ratio()
+        window_rows = np.array(new_windows)
+        new_windows.clear()
+        self._windows += _WINDOWS_PER_CHECK
+        self._moments *= _FORGETTING_FACTOR**_WINDOWS_PER_CHECK
+        self._moments += (_NEW_WINDOW_WEIGHTS * window_rows.T) @ window_rows
+        return self._check_ratio() if self._windows >= _MIN_WINDOW_COUNT else None
 
     def estimate_ratio(self) -> tuple[float, float]:
         """Return the ratio of net torque to inertia times acceleration, and its standard deviation.
 
-        The standard deviation is infinite if the windows do not determine the ratio.
+        They use the windows until the last check. The standard deviation is infinite if these do
+        not determine the ratio.
         """
         moment_matrix = self._moments
         window_weight = float(moment_matrix[2, 2])

@@ -64,6 +64,7 @@ class SensorMonitor:
         "_rate_hz",
         "_repeat_counts",
         "_runs",
+        "_shortest_limit",
         "_warned_channels",
     )
 
@@ -89,6 +90,7 @@ class SensorMonitor:
         self._runs = [0] * n
         self._any_run = False
         self._limits: list[int] | None = None
+        self._shortest_limit = 0
         self._fraction_limits: list[float] = []
         self._warned_channels: set[str] = set()
 
@@ -115,6 +117,7 @@ class SensorMonitor:
                 self._limits.append(
                     max(min_run_length, ceil(log(_MIN_RUN_PROBABILITY) / log(repeat_probability)))
                 )
+        self._shortest_limit = min(self._limits)
         self._fraction_limits = [
             repeat_fraction
             + max(
@@ -165,7 +168,8 @@ class SensorMonitor:
         """Compare the runs and the fraction of repeated readings with their limits."""
         runs, run_limits = self._runs, self._limits
         assert run_limits is not None
-        if runs[-1] > run_limits[-1]:
+        is_run_long = max(runs) > self._shortest_limit
+        if is_run_long and runs[-1] > run_limits[-1]:
             return INTERLOCKS_BY_NAME["frozen sensor"].violated(runs[-1], run_limits[-1])
         self._counted_ticks += 1
         if self._counted_ticks >= _REPEAT_COUNT_TICKS:
@@ -191,7 +195,7 @@ class SensorMonitor:
                     return INTERLOCKS_BY_NAME["repeated wrench"].violated(
                         100.0 * repeat_fraction, 100.0 * run_limit, repeated_part
                     )
-        if max(runs) <= min(run_limits):
+        if not is_run_long:
             return None
         for channel_name, run, run_limit in zip(
             self._channels[:-1], runs, run_limits, strict=False
