@@ -8,14 +8,12 @@ each result (`analysis.campaigns.SessionAnalysis`) and combines these in an
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from analysis.identify import RecordAnalysis, RecordFit, Selection, Setting, StructureFit
@@ -38,6 +36,8 @@ FigureFormat = Literal["png", "svg", "pdf"]
 """File format of figures."""
 FIGURE_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg", "pdf")
 """File formats in which figures can be written."""
+ImagesByName = dict[str, dict[FigureFormat, bytes]]
+"""Image files of figures, by the figure's name and the file format."""
 DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("svg",)
 """Default file formats of figures: that of the page. PNG and PDF would each double the time."""
 
@@ -343,6 +343,7 @@ def record_result(
     *,
     on_step: Callable[[str], None] = lambda _step_text: None,
     warn: Callable[[str], None] = lambda _warning_text: None,
+    on_welch: Callable[[WelchAnalysis], None] = lambda _welch_analysis: None,
 ) -> RecordResult:
     """Run the selected analyses of a session file.
 
@@ -356,6 +357,8 @@ def record_result(
         Called after each step with the step's name.
     warn : callable, optional
         Called with a sentence on each omitted analysis.
+    on_welch : callable, optional
+        Called with the Welch fits while another process fits the whole record.
 
     Raises
     ------
@@ -381,7 +384,10 @@ def record_result(
     if not options.with_welch_fits:
         check_record_band(record, options.band_hz)
         on_step("whole record")
-        return RecordResult(record, _fit_whole_record(record, options, warn))
+        whole_fits, warning_texts = _fit_whole_record(record, options)
+        for warning_text in warning_texts:
+            warn(warning_text)
+        return RecordResult(record, whole_fits)
     fit_welch = partial(
         welch_analysis, record, options.settings, options.band_hz, is_optional=options.whole_record
     )
@@ -389,19 +395,22 @@ def record_result(
         on_step("Welch fits")
         return RecordResult(record, None, fit_welch()[0])
     on_step("Welch fits and whole record")
-    welch_computation: AbstractContextManager[Callable[[], tuple[WelchAnalysis | None, str | None]]]
-    if options.settings.are_from_paper:
-        welch_computation = computed_in_parallel(fit_welch)
-    else:  # chosen settings may not suit the record, which is reported before the other fits
-        welch_outcome = fit_welch()
-        welch_computation = nullcontext(lambda: welch_outcome)
-    whole_fits, measurement_error = None, None
-    with welch_computation as welch_fits:
+    welch_results, omission_remark, measurement_error = None, None, None
+    is_welch_first = not options.settings.are_from_paper
+    if is_welch_first:  # chosen settings may not suit the record, which is reported at once
+        welch_results, omission_remark = fit_welch()
+    fit_whole = partial(_fit_whole_record, record, options)
+    with computed_in_parallel(fit_whole) as whole_fits_with_warnings:
+        if not is_welch_first:
+            welch_results, omission_remark = fit_welch()
+        if welch_results is not None:
+            on_welch(welch_results)
         try:
-            whole_fits = _fit_whole_record(record, options, warn)
+            whole_fits, warning_texts = whole_fits_with_warnings()
         except MeasurementError as error:
-            measurement_error = error
-        welch_results, omission_remark = welch_fits()
+            whole_fits, warning_texts, measurement_error = None, [], error
+    for warning_text in warning_texts:
+        warn(warning_text)
     if omission_remark is not None:
         warn(f"{path}: {omission_remark}")
         record = _add_warnings(record, (omission_remark,))
@@ -417,11 +426,15 @@ def record_result(
 
 
 def _fit_whole_record(
-    record: Record, options: AnalysisOptions, warn: Callable[[str], None]
-) -> WholeRecord:
-    """Fit all structures to a whole record, including the selected ones of installed packages."""
+    record: Record, options: AnalysisOptions
+) -> tuple[WholeRecord | None, list[str]]:
+    """Fit all structures to a whole record, including the selected ones of installed packages.
+
+    Return the fits, and warnings of structures that cannot be fitted.
+    """
     whole_fits = whole_record(record, options.fixed_parameters, options.band_hz)
-    return _add_structure_fits(whole_fits, options.structures, warn)
+    warning_texts: list[str] = []
+    return _add_structure_fits(whole_fits, options.structures, warning_texts.append), warning_texts
 
 
 def _add_structure_fits(

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from analysis.results import AnalysisOptions, RecordResult
+    from analysis.paper.welch_analysis import WelchAnalysis
+    from analysis.results import AnalysisOptions, ImagesByName, RecordResult
 
 _TEXT_WIDTH_CHARACTERS: Final = 120
 """Width in characters of texts that are printed to a file or a pipe."""
@@ -340,12 +341,25 @@ def _analyse_file(
 ) -> RecordResult:
     """Analyse one file, and write its report and its file for Rerun."""
     from analysis.report.folder import new_report_folder
-    from analysis.report.record_report import write_report
+    from analysis.report.record_report import draw_welch_figures, write_report
     from analysis.results import record_result
 
-    file_result = record_result(session_file, options, on_step=on_step, warn=warn)
+    welch_images: ImagesByName = {}
+
+    def draw_welch(analysis: WelchAnalysis) -> None:
+        welch_images.update(draw_welch_figures(analysis, options.figures, on_step))
+
+    file_result = record_result(
+        session_file, options, on_step=on_step, warn=warn, on_welch=draw_welch
+    )
     with new_report_folder(report_folder, overwrite=overwrite) as partial_folder:
-        write_report(file_result, partial_folder, on_step, formats=options.figures)
+        write_report(
+            file_result,
+            partial_folder,
+            on_step,
+            formats=options.figures,
+            welch_images=welch_images,
+        )
     if rerun_file is not None:
         from analysis.report import write_rerun_file
 

@@ -14,6 +14,7 @@ import logging
 import warnings
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Final
 
@@ -33,7 +34,7 @@ from rigd.runtime.computations import computed_in_parallel
 from rigd.spectral import magnitude_db
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from matplotlib.artist import Artist
@@ -42,10 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.legend import Legend
     from numpy.typing import NDArray
 
-    from analysis.results import FigureFormat
-
-    # Image files of a figure by their formats.
-    ImageByFormat = dict[FigureFormat, bytes]
+    from analysis.results import FigureFormat, ImagesByName
 
 # This hides messages about the font cache, which is slow to build or is being built by another
 # process. They affect no figure and mean nothing to the reader of a log.
@@ -261,15 +259,22 @@ def save_pictures(
     folder: Path,
     formats: Collection[FigureFormat] = DEFAULT_FORMATS,
     on_step: Callable[[str], None] = lambda _step_text: None,
+    drawn_images: ImagesByName | None = None,
 ) -> list[Picture]:
     """Draw figures, write each in several formats, and return them for a page.
 
     No two figures may have the same name. After each figure, `on_step` is called with a short text.
-    A picture is an SVG image, which can be searched and is sharp on paper. It is a PNG image if SVG
+    Figures in `drawn_images`, from `draw_images` with the same formats, are not drawn again. A
+    picture is an SVG image, which can be searched and is sharp on paper. It is a PNG image if SVG
     was not among the formats, or if the SVG image is large. Raise `OutputError` if a file exists or
     cannot be written.
     """
-    images = _draw_in_two_processes(illustrations, formats, on_step)
+    images = dict(drawn_images or {})
+    images |= _draw_in_two_processes(
+        [illustration for illustration in illustrations if illustration.name not in images],
+        formats,
+        on_step,
+    )
     pictures = []
     for illustration in illustrations:
         rendered_images = images[illustration.name]
@@ -295,32 +300,44 @@ def _draw_in_two_processes(
     illustrations: Sequence[Illustration],
     formats: Collection[FigureFormat],
     on_step: Callable[[str], None],
-) -> dict[str, ImageByFormat]:
+) -> ImagesByName:
     """Return the image files of each figure by its name; a forked process draws half of them."""
     own_illustrations, copied_illustrations = illustrations[::2], illustrations[1::2]
-    images: dict[str, ImageByFormat] = {}
     background_drawing = (
-        computed_in_parallel(
-            lambda: {each.name: _draw_images(each, formats) for each in copied_illustrations}
-        )
+        computed_in_parallel(partial(draw_images, copied_illustrations, formats))
         if copied_illustrations
         else nullcontext(dict)
     )
     with background_drawing as other_images:
-        for illustration in own_illustrations:
-            images[illustration.name] = _draw_images(illustration, formats)
-            on_step(f"figure {illustration.name}")
-        images |= other_images()
+        images = draw_images(own_illustrations, formats, on_step) | other_images()
     for illustration in copied_illustrations:
         on_step(f"figure {illustration.name}")
     return images
 
 
-def _draw_images(illustration: Illustration, formats: Collection[FigureFormat]) -> ImageByFormat:
+def draw_images(
+    illustrations: Iterable[Illustration],
+    formats: Collection[FigureFormat],
+    on_step: Callable[[str], None] = lambda _step_text: None,
+) -> ImagesByName:
+    """Draw figures; return the image files of each by its name. `on_step` is as in `save_pictures`.
+
+    The formats are the given ones, and one for the page.
+    """
+    images = {}
+    for illustration in illustrations:
+        images[illustration.name] = _draw_image(illustration, formats)
+        on_step(f"figure {illustration.name}")
+    return images
+
+
+def _draw_image(
+    illustration: Illustration, formats: Collection[FigureFormat]
+) -> dict[FigureFormat, bytes]:
     """Return a figure's images by file format: the requested ones, and one for the page."""
     with figure_style():
         figure = illustration.draw()
-        rendered_images: ImageByFormat = {
+        rendered_images: dict[FigureFormat, bytes] = {
             file_format: render_figure(figure, file_format) for file_format in formats
         }
         if not {"svg", "png"} & rendered_images.keys():

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.report._page import FactGroup
     from analysis.report._style import Illustration, Picture
-    from analysis.results import FigureFormat, RecordResult, WholeRecord
+    from analysis.results import FigureFormat, ImagesByName, RecordResult, WholeRecord
 
 # Page
 
@@ -341,6 +341,7 @@ def write_report(
     folder: Path,
     on_step: Callable[[str], None] = lambda _step_text: None,
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
+    welch_images: ImagesByName | None = None,
 ) -> None:
     """Write the report of a record into a folder.
 
@@ -358,6 +359,8 @@ def write_report(
         Function that is called after each figure with a short text.
     formats : sequence of str
         Formats of the figures.
+    welch_images : mapping, optional
+        Figures that `draw_welch_figures` has drawn already.
 
     Raises
     ------
@@ -377,7 +380,7 @@ def write_report(
         from analysis.report._record_figures import illustrations as record_illustrations
 
         illustrations = [*paper_illustrations, *record_illustrations(whole_record)]
-    pictures = save_pictures(illustrations, folder / "figures", formats, on_step)
+    pictures = save_pictures(illustrations, folder / "figures", formats, on_step, welch_images)
     write_new_file(folder / "tables.txt", tables_text(result))
     if whole_record is not None:
         paper_figure_count = len(paper_illustrations)
@@ -389,6 +392,32 @@ def write_report(
             pictures[:paper_figure_count],
         )
     write_new_file(folder / "analysis.json", document_text(document([result])))
+
+
+def draw_welch_figures(
+    analysis: WelchAnalysis,
+    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
+    on_step: Callable[[str], None] = lambda _step_text: None,
+) -> ImagesByName:
+    """Draw the Welch fits' figures of a report with whole-record fits, before these are known.
+
+    Parameters
+    ----------
+    analysis : WelchAnalysis
+        Welch fits.
+    formats : sequence of str
+        Formats of the figures.
+    on_step : callable, optional
+        Function that is called after each figure with a short text.
+
+    Returns
+    -------
+    dict
+        Image files by the figure's name and the format.
+    """
+    from analysis.report._style import draw_images
+
+    return draw_images(_welch_illustrations(analysis, has_whole_record=True), formats, on_step)
 
 
 def welch_figure_names(*, with_paper_figures: bool, has_whole_record: bool) -> tuple[str, ...]:

@@ -74,12 +74,12 @@ _FILTERS = [
 
 
 def start(command, *, env=None, packages=None, **options):
-    """Start a command, in a new process if its environment changes how Python itself starts.
+    """Start a command, in a new process if a limit or environment applies to Python's own start.
 
     Packages in the folder `packages` are installed for it.
     """
     env = dict(os.environ if env is None else env)
-    if _settings_of_python(env) != _OWN_SETTINGS:
+    if "preexec_fn" in options or _settings_of_python(env) != _OWN_SETTINGS:
         return subprocess.Popen(command, env=env, **options)
     if packages is not None:
         env["PYTHONPATH"] = os.fspath(packages)
