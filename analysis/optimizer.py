@@ -406,3 +406,7 @@ class RecentValues(Generic[_CachedValue]):
     def clear(self) -> None:
         """Forget all values."""
         self._values.clear()
+
+    def __reduce__(self) -> tuple[type[RecentValues[_CachedValue]], tuple[int]]:
+        """Pickle an empty cache: its values would be the largest part of a fit."""
+        return type(self), (self._points,)

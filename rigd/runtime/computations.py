@@ -1,5 +1,6 @@
 """Computations in a copy of this process, which has all of its objects and imports."""
 
+import copyreg
 import os
 import pickle
 import signal
@@ -7,7 +8,8 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from typing import Generic, Self, TypeVar
+from types import MappingProxyType
+from typing import Any, Generic, Self, TypeVar
 
 ValueT = TypeVar("ValueT")
 """Type of the value that is computed."""
@@ -41,7 +43,11 @@ class ForkedComputation(Generic[ValueT]):
         if self._process_id == 0:
             has_failed = True
             with suppress(BaseException):
-                pickle.dump(compute(), self._value_file, protocol=5)
+                pickler = pickle.Pickler(self._value_file, protocol=5)
+                pickler.dispatch_table = copyreg.dispatch_table | {
+                    MappingProxyType: lambda mapping: (_read_only_mapping, (dict(mapping),))
+                }
+                pickler.dump(compute())
                 self._value_file.flush()
                 has_failed = False
             os._exit(has_failed)
@@ -83,6 +89,11 @@ class ForkedComputation(Generic[ValueT]):
             if process_id:
                 self._exit_status = exit_status
         return self._exit_status is not None
+
+
+def _read_only_mapping(items: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    """Return a read-only mapping; a pickle refers to this function, as it cannot to the type."""
+    return MappingProxyType(items)
 
 
 @contextmanager
