@@ -302,7 +302,8 @@ def _draw_in_two_processes(
     on_step: Callable[[str], None],
 ) -> ImagesByName:
     """Return the image files of each figure by its name; a forked process draws half of them."""
-    own_illustrations, copied_illustrations = illustrations[::2], illustrations[1::2]
+    own_count = (len(illustrations) + 1) // 2
+    own_illustrations, copied_illustrations = illustrations[:own_count], illustrations[own_count:]
     background_drawing = (
         computed_in_parallel(partial(draw_images, copied_illustrations, formats))
         if copied_illustrations

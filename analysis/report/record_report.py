@@ -417,7 +417,13 @@ def draw_welch_figures(
     """
     from analysis.report._style import draw_images
 
-    return draw_images(_welch_illustrations(analysis, has_whole_record=True), formats, on_step)
+    welch_images = draw_images(
+        _welch_illustrations(analysis, has_whole_record=True), formats, on_step
+    )
+    # The rest of the report is imported now, because this process waits for the fits next.
+    from analysis.report import _page, _record_figures  # noqa: F401
+
+    return welch_images
 
 
 def welch_figure_names(*, with_paper_figures: bool, has_whole_record: bool) -> tuple[str, ...]:
