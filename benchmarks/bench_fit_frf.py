@@ -31,13 +31,13 @@ from rigd.spectral import FrequencyResponse, welch_response
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 ORDERS = ("alpha", "lambda")
 ROWS = (
-    # Measured 0.76 and 0.78.
+    # Measured 0.76 to 1.5.
     Row("slowest fit", most=2, unit="times a random start"),
     # Beyond 1e-9 a minimum would be missed.
     Row("cost over the lowest of the random starts, - 1", most=1e-9),
     Row("cost over the lowest of the grid, - 1", most=1e-9),
-    # Measured 1.3 to 1.5: the twelve fits compute common terms once.
-    Row("twelve fits", most=3, unit="times the slowest fit"),
+    # Measured 0.99: they share the grid of frequencies.
+    Row("twelve fits", most=1.2, unit="times one after the other"),
 )
 GRID_STEPS = {1: 201, 2: 41, 3: 13, 4: 7}  # points an axis, by the number of unknowns
 
@@ -155,7 +155,8 @@ def main() -> None:
             reached = np.mean(ends < fit.cost * (1 + 1e-4))
             grid = peer.local_grid(fit.parameters)
             ratios.append(spent / random_spent * gate.given.starts)
-            times.append(spent)
+            if structure in six:
+                times.append(spent)
             missed.append(fit.cost / ends.min() - 1)
             grids.append(fit.cost / grid - 1)
             print(
@@ -168,7 +169,7 @@ def main() -> None:
     gate.measured("slowest fit", max(ratios))
     gate.measured("cost over the lowest of the random starts, - 1", max(missed))
     gate.measured("cost over the lowest of the grid, - 1", max(grids))
-    gate.measured("twelve fits", twelve / max(times))
+    gate.measured("twelve fits", twelve / sum(times))
     gate.finish()
 
 
