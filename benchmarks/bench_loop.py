@@ -14,7 +14,7 @@ rounds it takes two minutes.
 import argparse
 import statistics
 
-from gate import Gate, Row
+from gate import Gate, Row, impossible_here
 from loop_rounds import Round, lateness_ratio, show
 
 from rigd.bench import HIGHEST_LOOP_RATE_HZ, cores_without_loop, loop_core
@@ -107,7 +107,7 @@ def main() -> None:
     granted = granted_realtime_settings(load_profile("sim").realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
     if not cyclictest.is_installed():
-        raise SystemExit("cyclictest is not installed (package rt-tests).")
+        impossible_here("The loop is not measured: cyclictest is not installed (package rt-tests).")
     rounds = []
     for _ in range(gate.given.rounds):
         rounds.append(one_round(gate.given.seconds, granted))

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from statistics import median
 
-from gate import Gate, Row, percent
+from gate import Gate, Row, impossible_here, percent
 from stop_scenarios import RIGD, SITUATIONS, can_isolate, isolated
 from timing import least_s
 
@@ -33,7 +33,7 @@ def main() -> None:
     gate = Gate(ROWS, parser)
     count = gate.given.count
     if not can_isolate():
-        raise SystemExit("rigd stop is not measured: that needs root and namespaces (unshare).")
+        impossible_here("rigd stop is not measured: that needs root and namespaces (unshare).")
     bare = [str(RIGD), "--version"]
     for name in SITUATIONS:
         bare_s = least_s(lambda: subprocess.run(bare, capture_output=True, check=True), 3)

@@ -10,7 +10,8 @@ A benchmark declares its rows and gives each its measured value::
         gate.finish()
 
 The program ends with exit code 1 if a row is beyond its limit or was not measured; with
-``--report`` it only prints. ``--json FILE`` writes the rows.
+``--report`` it only prints. ``--json FILE`` writes the rows. On a computer that lacks what a
+benchmark needs, it ends with exit code 3 and the reason, which is no error of `make bench`.
 """
 
 import argparse
@@ -21,7 +22,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
+
+EXIT_CODE_OF_IMPOSSIBLE = 3
+"""Exit code of a benchmark that this computer cannot run."""
+
+
+def impossible_here(reason: str) -> NoReturn:
+    """End a benchmark that this computer cannot run, with a sentence that says why."""
+    print(reason, file=sys.stderr)
+    sys.exit(EXIT_CODE_OF_IMPOSSIBLE)
 
 
 def percent(count: float, of: float) -> float:

@@ -5,7 +5,8 @@
 
 Each runs at its default size; all together take at most half an hour on an idle computer with two
 cores. The rows of all, with options and seconds, go to ``build/bench.json``. The exit code is 1 if
-a row is beyond its limit, or if a benchmark ended without a result.
+a row is beyond its limit, or if a benchmark ended without a result. Benchmarks that this computer
+cannot run are named.
 
 ``--release`` runs nothing: it appends the values of ``build/bench.json`` to
 ``docs/validation/benchmarks.json``, which has the last releases, and writes the page
@@ -23,7 +24,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from gate import Row
+from gate import EXIT_CODE_OF_IMPOSSIBLE, Row
 
 import rigd
 
@@ -39,10 +40,11 @@ INTRODUCTION = """# Benchmarks and their limits
 
 `make bench` runs `benchmarks/bench_*.py`, each at a size at which all together take at most half an
 hour on an idle computer of two cores, and ends with an error if a row is beyond its limit or was
-not measured. A ratio is to a peer of the same run, so that it hardly depends on the computer;
-limits in percent or in standard deviations are those of a few sessions, and wider than what the
-other pages report of many. `python benchmarks/bench_NAME.py --help` says what a benchmark measures
-and has an option for its size; `--report` prints without judging; `build/bench.json` has all rows.
+not measured. A benchmark that the computer cannot run is named, and is no error. A ratio is to a
+peer of the same run, so that it hardly depends on the computer; limits in percent or in standard
+deviations are those of a few sessions, and wider than what the other pages report of many.
+`python benchmarks/bench_NAME.py --help` says what a benchmark measures and has an option for its
+size; `--report` prints without judging; `build/bench.json` has all rows.
 
 This page is written by `python benchmarks/run_all.py --release`, which appends the values of the
 last `make bench` to `docs/validation/benchmarks.json`; each column is one release.
@@ -72,8 +74,10 @@ def run(name: str, *, report: bool) -> dict[str, Any]:
 
 
 def problems(result: dict[str, Any]) -> list[str]:
-    """Return the problems of a benchmark: rows beyond their limits, or no result."""
+    """Return the problems of a benchmark that ran: rows beyond their limits, or no result."""
     name, rows = result["benchmark"], result["rows"]
+    if result.get("exit_code") == EXIT_CODE_OF_IMPOSSIBLE:
+        return []
     if not rows:
         return [f"{name}: ended without a result (exit code {result['exit_code']})"]
     keys = ("name", "most", "least", "unit", "value")
@@ -152,6 +156,11 @@ def main() -> None:
     print(f"\n{count} rows of {len(results)} benchmarks; beyond a limit: {len(wrong) or 'none'}")
     for problem in wrong:
         print(f"    {problem}")
+    left_out = [
+        result["benchmark"] for result in results if result["exit_code"] == EXIT_CODE_OF_IMPOSSIBLE
+    ]
+    if left_out:
+        print(f"Not possible on this computer: {', '.join(left_out)}")
     print(f"All rows: {SUMMARY}")
     if wrong and not given.report:
         sys.exit(1)

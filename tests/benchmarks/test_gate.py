@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import run_all
-from gate import Gate, Row, percent
+from gate import Gate, Row, impossible_here, percent
 
 FOLDER = Path(run_all.__file__).parent
 ROWS = (
@@ -82,6 +82,14 @@ def test_summary_names_the_failures(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     ]
     lost = {"benchmark": "example", "rows": [], "exit_code": -9}
     assert run_all.problems(lost) == ["example: ended without a result (exit code -9)"]
+
+
+def test_a_benchmark_that_is_impossible_here_is_no_problem(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as end:
+        impossible_here("cyclictest is not installed.")
+    assert capsys.readouterr().err == "cyclictest is not installed.\n"
+    left_out = {"benchmark": "example", "rows": [], "exit_code": end.value.code}
+    assert run_all.problems(left_out) == []
 
 
 def test_a_release_is_appended_and_replaces_itself():
