@@ -1,4 +1,4 @@
-"""Results of a record: the whole record is fitted in another process, beside the Welch fits."""
+"""Results of a record: two processes make the Welch fits and fit the whole record."""
 
 import os
 from functools import partial
