@@ -381,6 +381,8 @@ def record_result(
     record = with_uniformity(record, options.uniformity)
     record = _add_warnings(record, analysis_remarks(record, options.band_hz))
     on_step("read")
+    whole_fits: WholeRecord | None = None
+    warning_texts: list[str] = []
     if not options.with_welch_fits:
         check_record_band(record, options.band_hz)
         on_step("whole record")
@@ -395,20 +397,18 @@ def record_result(
         on_step("Welch fits")
         return RecordResult(record, None, fit_welch()[0])
     on_step("Welch fits and whole record")
-    welch_results, omission_remark, measurement_error = None, None, None
-    is_welch_first = not options.settings.are_from_paper
-    if is_welch_first:  # chosen settings may not suit the record, which is reported at once
-        welch_results, omission_remark = fit_welch()
+    # Chosen settings may not suit the record, which is reported at once.
+    welch_outcome = None if options.settings.are_from_paper else fit_welch()
+    measurement_error = None
     fit_whole = partial(_fit_whole_record, record, options)
     with computed_in_parallel(fit_whole) as whole_fits_with_warnings:
-        if not is_welch_first:
-            welch_results, omission_remark = fit_welch()
+        welch_results, omission_remark = welch_outcome or fit_welch()
         if welch_results is not None:
             on_welch(welch_results)
         try:
             whole_fits, warning_texts = whole_fits_with_warnings()
         except MeasurementError as error:
-            whole_fits, warning_texts, measurement_error = None, [], error
+            measurement_error = error
     for warning_text in warning_texts:
         warn(warning_text)
     if omission_remark is not None:
@@ -425,9 +425,7 @@ def record_result(
     )
 
 
-def _fit_whole_record(
-    record: Record, options: AnalysisOptions
-) -> tuple[WholeRecord | None, list[str]]:
+def _fit_whole_record(record: Record, options: AnalysisOptions) -> tuple[WholeRecord, list[str]]:
     """Fit all structures to a whole record, including the selected ones of installed packages.
 
     Return the fits, and warnings of structures that cannot be fitted.
