@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.record_checks import RecordError, first_mode_hz
-from rigd.session import sweep_frequency_hz
+from rigd.session import linear_sweep_band_hz, sweep_frequency_hz
 
 if TYPE_CHECKING:
     from rigd.beam import Beam
@@ -134,11 +134,8 @@ def swept_frequencies_hz(
     first_tick, end_tick : int
         First tick inside one direction of the sweep, and the tick after the last.
     """
-    try:
-        sweep_ends_hz = float(session.metadata["start_hz"]), float(session.metadata["stop_hz"])
-    except (KeyError, ValueError):
-        return None
-    if "sweep" not in session.segments:
+    sweep_ends_hz = linear_sweep_band_hz(session.metadata.get("excitation", ""), session.metadata)
+    if sweep_ends_hz is None or "sweep" not in session.segments:
         return None
     swept_hz = [
         sweep_frequency_hz(session.segments, sweep_ends_hz, tick)

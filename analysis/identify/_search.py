@@ -69,6 +69,13 @@ def unknowns_shift_to_resonances(
 _COARSE_POINTS: Final = 400
 """Number of points of the coarse response."""
 
+_MIN_EXCITED_POWER_RATIO: Final = 1e-2
+"""Minimum power of the angle in a bin of the coarse response, relative to the largest power nearby.
+Between the lines of a multisine, leakage and ringing are all that a transform shows."""
+
+_EXCITED_BAND_COUNT: Final = 100
+"""Number of equal parts of the band, in each of which the powers are compared."""
+
 _COARSE_COST_TOLERANCE: Final = 1e-2
 """Relative tolerance of the cost in a descent on the coarse response."""
 
@@ -108,7 +115,16 @@ class CoarseResponse:
         # Without excitation the motor moved with the noise: such bins show no response.
         coherent_angle_spectrum = np.fft.rfft(comparison.reference_coherent_angle_rad())[band_bins]
         angle_power = coherent_angle_spectrum.real**2 + coherent_angle_spectrum.imag**2
-        is_excited = angle_power > 1e-12 * angle_power.max()
+        part_starts = np.arange(
+            0, angle_power.size, max(angle_power.size // _EXCITED_BAND_COUNT, 1)
+        )
+        largest_power_nearby = np.repeat(
+            np.maximum.reduceat(angle_power, part_starts),
+            np.diff(part_starts, append=angle_power.size),
+        )
+        is_excited = (angle_power > 1e-12 * angle_power.max()) & (
+            angle_power > _MIN_EXCITED_POWER_RATIO * largest_power_nearby
+        )
         measured_response, response_weights = (
             torque_spectrum[is_excited] / angle_spectrum[is_excited],
             angle_power[is_excited],
@@ -373,9 +389,14 @@ class Descent:
         """Return the noise spectrum of the current residual, without the free decay."""
         objective, comparison = self.objective, self.objective.comparison
         linearisation = objective.linearise(self.x)
-        is_near_mode = None
+        is_near_mode = driven_spectra = None
         if with_lines:
             frequency_hz = comparison.frequency_hz
+            angle, measured_torque = (
+                comparison.spectrum(channel[comparison.retained_samples])
+                for channel in (comparison.angle_rad, comparison.torque_nm)
+            )
+            driven_spectra = angle, linearisation.residual + measured_torque
             is_near_mode = np.zeros(frequency_hz.size, dtype=bool)
             for mode_pole in linearisation.poles:
                 mode_width_hz = resonance_half_width_hz(
@@ -391,6 +412,7 @@ class Descent:
             comparison.sample_count,
             comparison.measurement.known_torque_fraction,
             is_near_mode,
+            driven_spectra,
         )
 
 

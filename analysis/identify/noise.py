@@ -49,6 +49,14 @@ _RECORD_PART_COUNT: Final = 8
 _MIN_PART_POWER_RATIO: Final = 0.3
 """Smallest power in any eighth of the record, relative to the mean, of a line that lasts."""
 
+_MIN_LINE_TO_PREDICTION_RATIO: Final = 3.0
+"""Minimum amplitude of a line relative to the predicted torque, at a frequency at which the motor
+moves through the whole record, as with a multisine. The residual of a wrong model is smaller."""
+
+_COMPARED_PREDICTION_RATIO: Final = 1.1
+"""Largest ratio of a frequency whose predicted torque is compared with a line to that of the line.
+At the frequency itself, a wrong model may predict no torque."""
+
 
 @dataclass(frozen=True, slots=True)
 class NoiseLine:
@@ -122,6 +130,7 @@ def estimate_noise(
     sample_count: int,
     known_torque_fraction: float = 1.0,
     is_near_mode: NDArray[np.bool_] | None = None,
+    driven_spectra: tuple[NDArray[np.complex128], NDArray[np.complex128]] | None = None,
 ) -> NoiseSpectrum:
     """Estimate the noise spectrum and its lines from the residual of a fit.
 
@@ -138,6 +147,10 @@ def estimate_noise(
     is_near_mode : ndarray of bool, shape (K,), optional
         True for bins near a mode, which are never excluded: an excluded resonance is not fitted,
         and would therefore always appear as a line. Without this argument no line is searched for.
+    driven_spectra : tuple of ndarray of complex, shape (K,), optional
+        Fourier transforms of the motor's angle and of the torque that the model predicts. Where the
+        motion lasts through the record, a line is excluded only if it is much larger than the
+        predicted torque: otherwise it may be the error of the model.
 
     Returns
     -------
@@ -151,8 +164,13 @@ def estimate_noise(
         return NoiseSpectrum(noise_power, is_compared, ())
     for line_bins in _find_line_groups(residual, noise_power):
         line_power = np.abs(residual[line_bins]) ** 2
-        if is_near_mode[line_bins][np.argmax(line_power)] or not _lasts_through_record(
-            residual, line_bins
+        if (
+            is_near_mode[line_bins][np.argmax(line_power)]
+            or not _lasts_through_record(residual, line_bins)
+            or (
+                driven_spectra is not None
+                and _may_be_model_error(residual, *driven_spectra, frequency_hz, line_bins)
+            )
         ):
             continue
         is_compared[line_bins] &= is_near_mode[line_bins]
@@ -317,3 +335,24 @@ def _lasts_through_record(residual: NDArray[np.complex128], line_bins: slice) ->
     power_envelope = np.abs(np.fft.ifft(bins_around, padded_length)) ** 2
     mean_power_of_eighths = power_envelope.reshape(_RECORD_PART_COUNT, -1).mean(axis=1)
     return bool(mean_power_of_eighths.min() > _MIN_PART_POWER_RATIO * mean_power_of_eighths.mean())
+
+
+def _may_be_model_error(
+    residual: NDArray[np.complex128],
+    angle: NDArray[np.complex128],
+    predicted_torque: NDArray[np.complex128],
+    frequency_hz: NDArray[np.float64],
+    line_bins: slice,
+) -> bool:
+    """Return whether a wrong model of a beam that is driven steadily may cause a line."""
+    if not _lasts_through_record(angle, line_bins):
+        return False
+    compared_range_hz = (
+        frequency_hz[line_bins.start] / _COMPARED_PREDICTION_RATIO,
+        frequency_hz[line_bins][-1] * _COMPARED_PREDICTION_RATIO,
+    )
+    compared_bins = slice(*np.searchsorted(frequency_hz, compared_range_hz))
+    return bool(
+        np.abs(residual[line_bins]).max()
+        < _MIN_LINE_TO_PREDICTION_RATIO * np.abs(predicted_torque[compared_bins]).max()
+    )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rigd.errors import UserError
 from rigd.excitation._options import RestS, RingDownS, documented
-from rigd.session import sweep_frequency_hz
+from rigd.session import linear_sweep_band_hz, sweep_frequency_hz
 from rigd.session.limits import MAX_SAMPLES
 from rigd.units import is_usable_size
 
@@ -120,12 +120,10 @@ def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
     >>> present_frequency_hz(sweep, 51_000), present_frequency_hz(sweep, 0)
     (25.0, None)
     """
-    if excitation.kind != "chirp":
+    sweep_ends_hz = linear_sweep_band_hz(excitation.kind, excitation.parameters)
+    if sweep_ends_hz is None:
         return None
-    start_hz, stop_hz = (
-        float(excitation.parameters[option_name]) for option_name in ("start_hz", "stop_hz")
-    )
-    return sweep_frequency_hz(excitation.segments, (start_hz, stop_hz), tick)
+    return sweep_frequency_hz(excitation.segments, sweep_ends_hz, tick)
 
 
 # Checks of options

@@ -23,8 +23,9 @@ from rigd.runner._process_group import ProcessGroup
 from rigd.runner._worker_client import WorkerClient
 from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
+from rigd.session import linear_sweep_band_hz
 from rigd.sweep_response import sweep_ticks
-from rigd.view import SessionDescription, linear_sweep_band_hz
+from rigd.view import SessionDescription
 from rigd.view.plots import BUS_PLOT_COMPONENTS, REAL_TIME_PLOT_COMPONENTS
 
 _ADDRESS_TIMEOUT_S = 10.0

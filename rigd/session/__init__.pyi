@@ -18,6 +18,7 @@ from ._reader import read_timings as read_timings
 from ._reader import read_touches as read_touches
 from ._recovery import recover as recover
 from ._sample_digests import sample_digests as sample_digests
+from ._segments import linear_sweep_band_hz as linear_sweep_band_hz
 from ._segments import segments_until as segments_until
 from ._segments import sweep_frequency_hz as sweep_frequency_hz
 from ._summary import read_summary as read_summary

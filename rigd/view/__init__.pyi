@@ -10,6 +10,5 @@ from ._scene import Scene as Scene
 from ._session_info import Health as Health
 from ._session_info import Note as Note
 from ._session_info import SessionDescription as SessionDescription
-from ._session_info import linear_sweep_band_hz as linear_sweep_band_hz
 from ._session_info import outcome_note as outcome_note
 from .plots import Drawing as Drawing

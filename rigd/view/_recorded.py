@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rigd.beam import Beam
 from rigd.documents import DocumentError, parse_toml
-from rigd.session import Session, SessionError
+from rigd.session import Session, SessionError, linear_sweep_band_hz
 from rigd.session.layout import Status
 from rigd.session.quick_look import fit_of
 from rigd.session.touches import touch_line, touches_of
@@ -23,7 +23,6 @@ from rigd.view._session_info import (
     Health,
     Note,
     SessionDescription,
-    linear_sweep_band_hz,
     outcome_note,
 )
 from rigd.view.banner import ended_state

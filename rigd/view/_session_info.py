@@ -115,24 +115,6 @@ class SessionDescription:
         return sweep_frequency_hz(sweep_segments, self.sweep_hz, tick)
 
 
-def linear_sweep_band_hz(
-    excitation_kind: str, excitation_parameters: Mapping[str, float | int | str]
-) -> tuple[float, float] | None:
-    """Return the frequencies at the start and end of a linear sweep; None for other excitations.
-
-    Parameters
-    ----------
-    excitation_kind, excitation_parameters
-        Name of the excitation, and its parameters: name → number, or text as in a session file.
-    """
-    if excitation_kind != "chirp":
-        return None
-    try:
-        return float(excitation_parameters["start_hz"]), float(excitation_parameters["stop_hz"])
-    except (KeyError, ValueError):
-        return None
-
-
 @dataclass(frozen=True, slots=True)
 class Note:
     """Line of the session's log, with its time and level.

@@ -302,6 +302,16 @@ def test_a_part_has_the_samples_segments_and_counts_of_its_time(
     assert not any("cut short" in each for each in part.warnings)
 
 
+@pytest.mark.parametrize("kind", ["multisine", "until", "of a package"])
+def test_a_part_of_another_excitation_than_a_sweep_has_its_whole_band(
+    tmp_path, write_session, short_signals, kind
+):
+    metadata = {"excitation": kind, "start_hz": "0.5", "stop_hz": "32"}
+    path = write_session(tmp_path / "a.mcap", short_signals, metadata=metadata)
+    part = load_record(path, (None, 4.4))
+    assert (part.swept_hz, part.excited_hz) == (None, (0.5, 32.0))
+
+
 def test_a_part_with_the_rest_begins_from_it(tmp_path, write_session, short_signals):
     path = write_session(tmp_path / "a.mcap", short_signals)
     whole, part = load_record(path), load_record(path, (None, 4.4))

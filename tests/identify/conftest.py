@@ -107,14 +107,14 @@ def sweep_rad(t, sweep_s=SWEEP_S):
     return np.where((t >= 0) & (t < sweep_s), 0.025 * np.sin(phase), 0.0)
 
 
-def multisine_rad(t):
-    """A period of 10 s, three times over."""
+def multisine_rad(t, duration_s=SWEEP_S):
+    """A period of 10 s, over and over."""
     line_hz = np.arange(10, 401) / 10
     phases = np.random.default_rng(3).uniform(0, 2 * np.pi, line_hz.size)
-    during = (t >= 0) & (t < SWEEP_S)
+    during = (t >= 0) & (t < duration_s)
     period = np.cos(2 * np.pi * line_hz * t[during][:10_000, None] + phases).sum(axis=1)
     reference = np.zeros(t.size)
-    reference[during] = np.tile(0.01 / np.abs(period).max() * period, round(SWEEP_S / 10))
+    reference[during] = np.tile(0.01 / np.abs(period).max() * period, duration_s // 10)
     return reference
 
 
@@ -135,7 +135,7 @@ def session(
     """
     before = 5.0 if shaken else 0.0
     t = np.arange(round((before + sweep_s + 11) * RATE_HZ)) / RATE_HZ - before - 1
-    reference = multisine_rad(t) if multisine else sweep_rad(t, sweep_s)
+    reference = (multisine_rad if multisine else sweep_rad)(t, sweep_s)
     reference[t < -2] += 0.01 * np.sin(2 * np.pi * 2.6 * (t[t < -2] + 1 + before))
     reference[t < -2] += 0.002 * np.sin(2 * np.pi * 16 * (t[t < -2] + 1 + before))
     return response(reference, PLANTS[name], beam, delay_s, tool_inertia_kg_m2, offsets)

@@ -102,6 +102,19 @@ def test_residual_of_a_multisine_is_no_hum(sessions, plant, structure):
     assert analysed(sessions(plant, multisine=True), structure).lines == ()
 
 
+def test_multisine_of_many_periods(sessions, plants):
+    """Between its lines, which are 25 bins apart here, a record shows no response of the beam."""
+    found = analysed(sessions("VI", multisine=True, sweep_s=250)).fits[0]
+    assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.1)
+    for name, true_value in (("alpha", plants["VI"].alpha), ("lambda", plants["VI"].lambda_)):
+        assert abs(found.parameters[name] - true_value) < 4 * found.std[name], name
+
+
+def test_residual_of_a_beam_that_is_not_uniform_is_no_hum(sessions):
+    beam = sessions("VI", multisine=True, sweep_s=120, offsets=(0.02, -0.01))
+    assert fit_record(beam.measured(noise_nm=3e-4, seed=21), [STRUCTURES["VI"]]).lines == ()
+
+
 def test_a_burst_at_a_mode_is_no_hum(sessions):
     session = sessions("VI")
     t = np.arange(session.torque_nm.size) / 1000
