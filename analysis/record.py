@@ -6,7 +6,10 @@ incomplete sweep. This module interpolates such samples within limits, counts an
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,7 +37,7 @@ from analysis.record_ticks import (
     TickGrid,
     TorqueExtreme,
 )
-from rigd.session import Session, limits, read_session, readable_texts
+from rigd.session import Session, SessionError, limits, read_session, readable_texts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -280,13 +283,11 @@ def load_record(
     >>> print(record.sweep_samples, record.gaps.missing_ticks)
     20000 0
     """
-    if not _may_be_longer(path, longest_samples):
+    if not may_be_longer(path, longest_samples):
         session = read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES)
         return record_of(session, part_s, highest_hz=highest_hz, longest_samples=longest_samples)
     # The signals are read after the ticks of all samples: they may take too much memory.
-    session = read_session(
-        path, fields=_TICK_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
-    )
+    session, interval_s = _read_ticks(path, part_s)
     grid, covered_interval_s = _tick_grid_of(session, part_s)
     # The grid replaces the ticks, of which a long record has many.
     session = replace(session, samples=session.samples[:0].copy())
@@ -297,7 +298,12 @@ def load_record(
         rest_angles_rad.append(_rest_angles_rad(session, samples))
         signal_collector.add(samples)
 
-    read_session(path, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS, on_samples=add_samples)
+    read_session(
+        path,
+        max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
+        on_samples=add_samples,
+        part_s=interval_s,
+    )
     return _make_record(
         session,
         grid,
@@ -307,7 +313,28 @@ def load_record(
     )
 
 
-def _may_be_longer(path: Path, sample_count: int) -> bool:
+def _read_ticks(
+    path: Path, part_s: PartOption | None
+) -> tuple[Session, tuple[float, float] | None]:
+    """Read the ticks of a session, or of the chunks that contain a part of it.
+
+    The second result is the interval in s whose chunks were read; None for all of them.
+    """
+    read_ticks = partial(
+        read_session, path, fields=_TICK_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+    )
+    if part_s is not None:
+        interval_s = (part_s[0] or 0.0, math.inf if part_s[1] is None else part_s[1])
+        with suppress(SessionError):  # raised again if the whole file has the error
+            session = read_ticks(part_s=interval_s)
+            if len(session.samples):
+                end_s = (int(session.samples["tick"][-1]) + 1) / stated_rate_hz(session)
+                if interval_s[0] < end_s and (part_s[1] is None or part_s[1] <= end_s):
+                    return session, interval_s
+    return read_ticks(), None
+
+
+def may_be_longer(path: Path, sample_count: int) -> bool:
     """Return whether a file may contain more than a number of samples, by its size."""
     try:
         return path.stat().st_size > sample_count * _MIN_SAMPLE_BYTES

@@ -1,17 +1,19 @@
-"""Part of a session that is analysed instead of the whole: its samples and segments."""
+"""Parts of a session that are analysed instead of the whole: samples, segments, equal blocks."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from analysis.record_checks import RecordError, first_mode_hz
-from rigd.session import linear_sweep_band_hz, sweep_frequency_hz
+from rigd.session import SessionError, linear_sweep_band_hz, read_summary, sweep_frequency_hz
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rigd.beam import Beam
     from rigd.session import Session
 
@@ -24,6 +26,96 @@ part, and a shorter part does not distinguish this ringing from the response to 
 
 _TICK_TOLERANCE: Final = 1e-3
 """Tolerance in ticks for the rounding of a time that is stated in seconds."""
+
+BLOCK_S: Final = 900.0
+"""Default length in seconds of the blocks of a long session."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSource:
+    """Session file of which all or a part is analysed as one record.
+
+    Attributes
+    ----------
+    path : Path
+        Session file.
+    part_s : tuple of float or None
+        Beginning and end of the part in seconds since the session's start, None for the beginning
+        or end of the session. None for the whole session.
+    """
+
+    path: Path
+    part_s: PartOption | None = None
+
+    @property
+    def part_name(self) -> str:
+        """Beginning and end of the part as a name, such as "0 to 900 s"; empty for the whole."""
+        if self.part_s is None:
+            return ""
+        from_s, to_s = self.part_s
+        end_text = "end" if to_s is None else f"{to_s:g} s"
+        return f"{from_s or 0.0:g} to {end_text}"
+
+    def __str__(self) -> str:
+        return f"{self.path}, {self.part_name}" if self.part_s else str(self.path)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return file and part as the first columns of a table in a file."""
+        return {
+            "file": str(self.path),
+            **(dict(zip(("from_s", "to_s"), self.part_s, strict=True)) if self.part_s else {}),
+        }
+
+
+def blocks_of_session(path: Path, block_s: float = BLOCK_S) -> tuple[RecordSource, ...]:
+    """Divide a session into consecutive blocks of equal length; only the last may be longer.
+
+    Parameters
+    ----------
+    path : Path
+        Session file.
+    block_s : float
+        Length of the blocks in seconds. The last one also covers a remainder of less than half.
+
+    Raises
+    ------
+    SessionError
+        The file cannot be read or is damaged.
+    RecordError
+        The session is too short for two blocks, or is a linear sweep, whose blocks have different
+        frequencies.
+    """
+    summary = read_summary(path)
+    if summary.samples is None:
+        raise SessionError(f"{path}: {summary.problem}")
+    metadata = summary.metadata
+    if linear_sweep_band_hz(metadata.get("excitation", ""), metadata) is not None:
+        raise RecordError(
+            f"{path}: blocks of one sweep have different frequencies, so they do not show what "
+            "changes with time. Record several sweeps (rigd run chirp --repeat) and analyse them "
+            "together, or a part of this one (--from, --to)."
+        )
+    try:
+        rate_hz = float(metadata["rate_hz"])
+    except (KeyError, ValueError):
+        rate_hz = math.nan
+    if not 0.0 < rate_hz < math.inf:
+        raise RecordError(
+            f"{path}: rate_hz in the metadata 'session' is missing or no number in Hz. The writing "
+            "program must state it."
+        )
+    duration_s = summary.samples / rate_hz
+    block_count = math.floor(duration_s / block_s + 0.5)
+    if block_count < 2:
+        raise RecordError(
+            f"{path}: {duration_s:g} s are too short for two blocks of {block_s:g} s; choose a "
+            "shorter --block."
+        )
+    limits_s = [block_s * number for number in range(1, block_count)]
+    return tuple(
+        RecordSource(path, part_s)
+        for part_s in zip([None, *limits_s], [*limits_s, None], strict=True)
+    )
 
 
 def part_of_session(

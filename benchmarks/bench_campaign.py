@@ -39,6 +39,7 @@ from analysis.models import (
     weights,
 )
 from analysis.paper import fit_many
+from analysis.record_part import RecordSource
 from analysis.report.campaign_report import write_campaign
 from rigd.beam import Damping, Plant, ResponseGrid
 
@@ -77,7 +78,7 @@ def welch_only(paths: list[Path]) -> int:
     """Fit by the Welch method alone, on two workers; their start is part of the time."""
     task = SessionTask(WelchSettings(), (), (), BAND_HZ)
     with process_pool(JOBS) as pool:
-        results = pool.run(analyse_session, [(path, task) for path in paths])
+        results = pool.run(analyse_session, [(RecordSource(path), task) for path in paths])
     return sum(len(result.welch_models) for result in results)
 
 
@@ -101,7 +102,7 @@ def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
     """
     from scipy.optimize import minimize
 
-    result = analyse_session(path, SessionTask(WelchSettings(), (), (), BAND_HZ))
+    result = analyse_session(RecordSource(path), SessionTask(WelchSettings(), (), (), BAND_HZ))
     response_grid = ResponseGrid(2j * np.pi * result.frequency_hz)
     plant = Plant(result.beam, Damping(), tool_inertia_kg_m2=result.tool_inertia_kg_m2)
     rng = np.random.default_rng(0)
@@ -161,7 +162,7 @@ def main() -> None:
         )
         task = SessionTask(WelchSettings(), (), (), BAND_HZ)
         begun = time.process_time()
-        analyse_session(paths[0], task)
+        analyse_session(RecordSource(paths[0]), task)
         alone_s = time.process_time() - begun
         print(f"  in this process {alone_s:.2f} s of CPU time a session")
         report = Path(name) / "report"

@@ -43,6 +43,7 @@ from analysis.campaigns.pooling import PooledEstimate, PooledMode, freest_estima
 from analysis.campaigns.specimen_sentences import WRONG_METADATA_REMEDY
 from analysis.campaigns.workers import FailedTask, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
+from analysis.record_part import RecordSource, blocks_of_session
 from analysis.validity import combined_validity
 
 if TYPE_CHECKING:
@@ -140,6 +141,7 @@ def campaign(
     paths: Sequence[Path],
     settings: WelchSettings | None = None,
     *,
+    block_s: float | None = None,
     structures: Sequence[str] = tuple(STRUCTURES),
     fixed_parameters: Sequence[Setting] = (),
     band_hz: tuple[float, float] | None = None,
@@ -163,6 +165,9 @@ def campaign(
         Session files.
     settings : WelchSettings, optional
         Settings of the Welch fits, by default the paper's.
+    block_s : float, optional
+        Length in seconds of the blocks into which each session is divided. A block then counts as
+        a session. By default, sessions are not divided.
     structures : sequence of str
         Structures of the whole-record fits to choose from. An empty sequence omits these fits,
         the verdict and the validation of the fits.
@@ -188,6 +193,8 @@ def campaign(
     ------
     CampaignError
         No session could be analysed, or no workers are available.
+    SessionError, RecordError
+        A session cannot be divided into blocks.
 
     Notes
     -----
@@ -198,11 +205,18 @@ def campaign(
         raise CampaignError("A campaign needs session files, and none was given.")
     if dask_address is not None:
         paths = [path.absolute() for path in paths]
+    sources = [
+        source
+        for path in paths
+        for source in (
+            [RecordSource(path)] if block_s is None else blocks_of_session(path, block_s)
+        )
+    ]
     settings = settings or WelchSettings()
     session_task = SessionTask(
         settings, tuple(structures), tuple(fixed_parameters), band_hz, uniformity
     )
-    done_steps, total_steps = 0, 2 * len(paths)
+    done_steps, total_steps = 0, 2 * len(sources)
 
     def report_step(file_name: str) -> None:
         """Report the completion of a step for a file."""
@@ -216,19 +230,19 @@ def campaign(
     elif dask_address is not None:
         workers_manager = dask_cluster(dask_address)
     else:
-        workers_manager = process_pool(min(jobs or available_cores(), len(paths)))
+        workers_manager = process_pool(min(jobs or available_cores(), len(sources)))
     with workers_manager as ready_workers:
         session_results = ready_workers.run(
             analyse_session,
-            [(path, session_task) for path in paths],
-            lambda i: report_step(paths[i].name),
+            [(source, session_task) for source in sources],
+            lambda i: report_step(sources[i].part_name or sources[i].path.name),
         )
         sessions, failures = _separate_experiments(
             [
-                SessionFailure(path, f"{path}: {session_result.reason}; analyse it by itself.")
+                SessionFailure(source, f"{source}: {session_result.reason}; analyse it by itself.")
                 if isinstance(session_result, FailedTask)
                 else session_result
-                for path, session_result in zip(paths, session_results, strict=True)
+                for source, session_result in zip(sources, session_results, strict=True)
             ]
         )
         if not sessions:
@@ -239,8 +253,8 @@ def campaign(
         validation: tuple[LeaveOneOutResult, ...] = ()
         failed_predictions: tuple[FailedPrediction, ...] = ()
         if len(sessions) >= MIN_VALIDATED_SESSIONS:
-            total_steps = len(paths) + len(sessions)
-            session_names = [session.path.name for session in sessions]
+            total_steps = len(sources) + len(sessions)
+            session_names = [session.name for session in sessions]
             validation, failed_predictions = validate(
                 ready_workers, sessions, band_hz, lambda i: report_step(session_names[i])
             )
@@ -260,7 +274,7 @@ def campaign_result(
     could not be.
     """
     session_names = distinct_names(
-        [*(session.path for session in sessions), *(session.path for session in failures)]
+        [*(session.source for session in sessions), *(session.source for session in failures)]
     )
     sessions = [
         replace(session, name=session_name)
@@ -348,8 +362,8 @@ def _separate_experiments(
         else:
             failures.append(
                 SessionFailure(
-                    session_result.path,
-                    f"{session_result.path}: {reason}",
+                    session_result.source,
+                    f"{session_result.source}: {reason}",
                     session_result.experiment,
                 )
             )
@@ -375,8 +389,8 @@ def _unify_welch_fits(
         return [session.without_welch() for session in sessions], failures
     excluded_sessions = [
         SessionFailure(
-            session.path,
-            f"{session.path}: {session.warnings[-1]} Most others have them: analyse this one by "
+            session.source,
+            f"{session.source}: {session.warnings[-1]} Most others have them: analyse this one by "
             "itself.",
             session.experiment,
         )
@@ -431,7 +445,7 @@ def _exclusion_reason(
     if isinstance(session_result, SessionFailure):
         return None
     for other_session in accepted_sessions:
-        if session_result.path == other_session.path:
+        if session_result.source == other_session.source:
             return "the file is given more than once, and counts once."
         if (
             session_result.experiment.session_identifiers

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from analysis.record import Record
+    from analysis.record_part import RecordSource
 
 
 class CampaignError(ValueError):
@@ -126,9 +127,12 @@ class Experiment:
             },
             sweep_s=record.sweep_samples / record.rate_hz,
             session_identifiers=(
-                (metadata["id"], metadata["start_utc_ns"])
-                if {"id", "start_utc_ns"} <= metadata.keys()
-                else (str(record.path.resolve()),)
+                *(
+                    (metadata["id"], metadata["start_utc_ns"])
+                    if {"id", "start_utc_ns"} <= metadata.keys()
+                    else (str(record.path.resolve()),)
+                ),
+                *(() if record.part_text is None else (record.part_text,)),
             ),
             start_utc=_utc_text(metadata.get("start_utc_ns", "")),
             operator=metadata.get("operator", "").strip(),
@@ -217,8 +221,8 @@ class Experiment:
 class SessionFailure:
     """A session that a campaign does not use, and the reason."""
 
-    path: Path
-    """Path of the session file."""
+    source: RecordSource
+    """Session file, and the part of it that is not used."""
     message: str
     """Sentence that states for the operator why the session is not used."""
     experiment: Experiment | None = None
@@ -227,11 +231,27 @@ class SessionFailure:
     """Name in tables (see `distinct_names`); the name of the file by default."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", self.name or self.path.name)
+        object.__setattr__(self, "name", self.name or self.source.part_name or self.path.name)
+
+    @classmethod
+    def from_error(
+        cls, source: RecordSource, error: Exception, experiment: Experiment | None
+    ) -> SessionFailure:
+        """Return the failure of a session or a part of it by an error, which names the file."""
+        part_text = f"{source.part_name}: " if source.part_s else ""
+        return cls(source, f"{part_text}{error}", experiment)
+
+    @property
+    def path(self) -> Path:
+        """Path of the session file."""
+        return self.source.path
 
 
-def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Return for each path the shortest trailing part that identifies it among the paths."""
+def distinct_names(sources: Sequence[RecordSource]) -> list[str]:
+    """Return the part of each source, or the shortest end of its path that no other one has."""
+    if any(source.part_s for source in sources):
+        return [source.part_name for source in sources]
+    paths = [source.path for source in sources]
     short_names = [path.name for path in paths]
     for part_count in range(2, max((len(path.parts) for path in paths), default=0) + 1):
         name_counts = Counter(short_names)

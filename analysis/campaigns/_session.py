@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from analysis.identify import Candidate, ModalEstimate, Setting
     from analysis.identify.verdict import Verdict
     from analysis.paper.welch_analysis import FittedModel, Peak
+    from analysis.record_part import RecordSource
     from analysis.results import WholeRecord
     from rigd.beam import Beam, Plant
 
@@ -48,8 +49,8 @@ class SessionAnalysis:
 
     Attributes
     ----------
-    path : Path
-        Path of the session file.
+    source : RecordSource
+        Session file, and the part of it that was analysed.
     experiment : Experiment
         Specimen and excitation stated in the file.
     beam : Beam
@@ -94,7 +95,7 @@ class SessionAnalysis:
         Stated relative standard deviation of mode frequencies from those of a uniform beam.
     """
 
-    path: Path
+    source: RecordSource
     experiment: Experiment
     beam: Beam
     tool_inertia_kg_m2: float
@@ -118,7 +119,12 @@ class SessionAnalysis:
     uniformity: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", self.name or self.path.name)
+        object.__setattr__(self, "name", self.name or self.source.part_name or self.path.name)
+
+    @property
+    def path(self) -> Path:
+        """Path of the session file."""
+        return self.source.path
 
     def without_welch(self) -> SessionAnalysis:
         """Return the session without results of Welch's method."""
@@ -165,15 +171,17 @@ class SessionTask:
     uniformity: float | None = None
 
 
-def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | SessionFailure:
+def analyse_session(
+    source: RecordSource, session_task: SessionTask
+) -> SessionAnalysis | SessionFailure:
     """Read and analyse a session by a fit to the whole record, and by Welch's method if applicable.
 
     An error of one session is returned, not raised, because the others are still usable.
 
     Parameters
     ----------
-    path : Path
-        Session file.
+    source : RecordSource
+        Session file, or a part of it.
     session_task : SessionTask
         Settings of the analysis.
     """
@@ -184,13 +192,17 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
     experiment = None
     try:
         record = with_uniformity(
-            load_record(path, highest_hz=highest_frequency_hz(session_task.band_hz)),
+            load_record(
+                source.path,
+                source.part_s,
+                highest_hz=highest_frequency_hz(session_task.band_hz),
+            ),
             session_task.uniformity,
         )
         experiment = Experiment.from_record(record)
         unfinished_reason = experiment.unfinished_sweep_reason(record.outcome)
-        if unfinished_reason:
-            return SessionFailure(path, f"{path}: {unfinished_reason}", experiment)
+        if unfinished_reason and source.part_s is None:
+            return SessionFailure(source, f"{source}: {unfinished_reason}", experiment)
         welch_results, omission_remark = welch_analysis(
             record,
             session_task.settings,
@@ -198,9 +210,11 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
             is_optional=bool(session_task.structure_names),
         )
     except session_errors as error:
-        return SessionFailure(path, str(error), experiment)
+        return SessionFailure.from_error(source, error, experiment)
     except MemoryError:
-        return SessionFailure(path, f"{path}: not enough memory to analyse it; use fewer --jobs.")
+        return SessionFailure(
+            source, f"{source}: not enough memory to analyse it; use fewer --jobs."
+        )
     warnings = record.warnings if welch_results is None else welch_results.warnings
     warnings = (
         *warnings,
@@ -215,23 +229,28 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
             )
         except session_errors as error:
             if welch_results is None:
-                return SessionFailure(path, str(error), experiment)
+                return SessionFailure.from_error(source, error, experiment)
             warnings = (*warnings, f"Not in the whole-record estimate: {error}")
         except (MemoryError, np.linalg.LinAlgError) as error:
             failure_reason = "not enough memory" if isinstance(error, MemoryError) else error
-            warnings = (*warnings, f"Not in the whole-record estimate: {path}: {failure_reason}")
+            warnings = (*warnings, f"Not in the whole-record estimate: {source}: {failure_reason}")
     findings = record_result.verdict.findings if record_result else ()
     if invalidating_findings := next(
         (finding.sentence for finding in findings if finding.kind in _INVALIDATING_FINDING_KINDS),
         None,
     ):
-        return SessionFailure(path, f"{path}: {invalidating_findings}", experiment)
+        return SessionFailure(source, f"{source}: {invalidating_findings}", experiment)
     return _session_result(
-        RecordResult(record, record_result, welch_results), session_task, experiment, warnings
+        source,
+        RecordResult(record, record_result, welch_results),
+        session_task,
+        experiment,
+        warnings,
     )
 
 
 def _session_result(
+    source: RecordSource,
     record_result: RecordResult,
     session_task: SessionTask,
     experiment: Experiment,
@@ -252,7 +271,7 @@ def _session_result(
     if welch_results is not None:
         used_settings = replace(used_settings, **asdict(welch_results.segmentation))
     return SessionAnalysis(
-        path=record.path,
+        source=source,
         experiment=experiment,
         beam=record.beam,
         tool_inertia_kg_m2=record.tool_inertia_kg_m2,

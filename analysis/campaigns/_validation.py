@@ -16,10 +16,10 @@ from rigd.beam import Plant
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from pathlib import Path
 
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.workers import Workers
+    from analysis.record_part import RecordSource
 
 MIN_VALIDATED_SESSIONS: Final = 3
 """Smallest number of sessions for which each can be predicted from the others, as pooling needs
@@ -32,8 +32,8 @@ class LeaveOneOutResult:
 
     Attributes
     ----------
-    path : Path
-        File of the session.
+    source : RecordSource
+        File of the session, and the part of it that was predicted.
     method : {"record", "welch"}
         Source of the parameters: pooled whole-record estimates of the other sessions, or their
         nominal model by the Welch method.
@@ -49,7 +49,7 @@ class LeaveOneOutResult:
         errors include the noise, so the sessions agree if `error` is no larger than `own_error`.
     """
 
-    path: Path
+    source: RecordSource
     method: str
     name: str
     weighting: str | None
@@ -61,8 +61,8 @@ class LeaveOneOutResult:
 class FailedPrediction:
     """A session that could not be predicted from the other sessions, and the reason."""
 
-    path: Path
-    """Path of the session file."""
+    source: RecordSource
+    """Session file, and the part of it that was not predicted."""
     reason: str
     """Reason, as the end of a sentence."""
 
@@ -112,18 +112,18 @@ def validate(
     If all workers are lost, all sessions count as not predicted.
     """
     prediction_tasks = [
-        (session.path, models_without_session(sessions, i), band_hz)
+        (session.source, models_without_session(sessions, i), band_hz)
         for i, session in enumerate(sessions)
     ]
     try:
         task_results = workers.run(leave_one_out_results, prediction_tasks, on_done)
     except CampaignError as error:
-        return (), tuple(FailedPrediction(session.path, str(error)) for session in sessions)
+        return (), tuple(FailedPrediction(session.source, str(error)) for session in sessions)
     prediction_errors: list[LeaveOneOutResult] = []
     failed_predictions: list[FailedPrediction] = []
     for session, task_result in zip(sessions, task_results, strict=True):
         if isinstance(task_result, FailedTask):
-            failed_predictions.append(FailedPrediction(session.path, task_result.reason))
+            failed_predictions.append(FailedPrediction(session.source, task_result.reason))
         elif isinstance(task_result, FailedPrediction):
             failed_predictions.append(task_result)
         else:
@@ -132,7 +132,9 @@ def validate(
 
 
 def leave_one_out_results(
-    path: Path, predictions: Sequence[PlantPrediction], band_hz: tuple[float, float] | None
+    source: RecordSource,
+    predictions: Sequence[PlantPrediction],
+    band_hz: tuple[float, float] | None,
 ) -> tuple[LeaveOneOutResult, ...] | FailedPrediction:
     """Return the error of each model in predicting a session's torque from its angle.
 
@@ -143,13 +145,17 @@ def leave_one_out_results(
     from analysis.record import load_record
 
     try:
-        record = load_record(path, highest_hz=highest_frequency_hz(band_hz))
+        record = load_record(
+            source.path,
+            source.part_s,
+            highest_hz=highest_frequency_hz(band_hz),
+        )
         band_hz = record_band_hz(record, band_hz)
         comparison = Comparison.from_measurement(Measurement.from_record(record), band_hz)
     except session_error_types() as why:
-        return FailedPrediction(path, str(why))
+        return FailedPrediction(source, str(why))
     except MemoryError:
-        return FailedPrediction(path, "not enough memory to predict it; use fewer --jobs")
+        return FailedPrediction(source, "not enough memory to predict it; use fewer --jobs")
     measured_torque_nm = comparison.torque_nm[comparison.retained_samples]
     torque_norm = np.linalg.norm(comparison.spectrum(measured_torque_nm))
 
@@ -163,7 +169,7 @@ def leave_one_out_results(
 
     return tuple(
         LeaveOneOutResult(
-            path=path,
+            source=source,
             method=prediction.method,
             name=prediction.name,
             weighting=prediction.weighting,

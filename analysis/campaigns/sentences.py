@@ -524,7 +524,8 @@ def describe_failed_predictions(
     if not failed_predictions:
         return []
     reason_texts = [
-        f"{failed_prediction.path.name}: {failed_prediction.reason}"
+        f"{failed_prediction.source.part_name or failed_prediction.source.path.name}: "
+        f"{failed_prediction.reason}"
         for failed_prediction in failed_predictions
     ]
     return [

@@ -266,6 +266,15 @@ def analyze(
             "[default: its end]",
         ),
     ] = None,
+    block: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            help="Divide a session into blocks of this length (s), and compare them as the "
+            "sessions of a campaign: shows what changes with time.  [default: 900 for more than "
+            "4 million samples]",
+        ),
+    ] = None,
     band: Band = None,
     frf: Estimator = "h1",
     segment: Segment = None,
@@ -351,7 +360,11 @@ def analyze(
     except NoSessionsError as error:
         print_error(str(error))
         raise typer.Exit(1) from None
-    is_campaign = len(files) > 1 and not each
+    if block is None and from_s is None and to_s is None and len(files) == 1 and not each:
+        block = _block_length_of_long_session(files[0])
+    elif block is not None:
+        _check_block_option(block, files, has_part=from_s is not None or to_s is not None)
+    is_campaign = (len(files) > 1 and not each) or block is not None
     if not is_campaign:
         campaign_options = {
             "--paper": paper,
@@ -411,10 +424,14 @@ def analyze(
             from analysis.campaigns import CampaignError, SingleSessionError
             from analysis.cli.campaign import campaign_command
             from analysis.models import STRUCTURES
+            from analysis.record_checks import RecordError
+            from rigd.session import SessionError
 
             typer.echo(
                 f"{len(files)} sessions are analysed together, as a campaign; --each reports each "
-                "by itself.",
+                "by itself."
+                if block is None
+                else f"The session is analysed in blocks of {block:g} s, as a campaign.",
                 err=True,
             )
             try:
@@ -423,10 +440,11 @@ def analyze(
                     structures=tuple(STRUCTURES) if options.whole_record else (),
                     fixed=options.fixed_parameters, band_hz=options.band_hz, jobs=jobs, dask=dask,
                     uniformity=options.uniformity, with_paper=paper, formats=options.figures,
+                    block_s=block,
                 )  # fmt: skip
             except SingleSessionError as single:
                 exit_code = _report_single_session(single, options, output_options)
-            except CampaignError as error:
+            except (CampaignError, SessionError, RecordError) as error:
                 print_error(str(error))
                 exit_code = 1
     except OutputExistsError as error:
@@ -439,6 +457,39 @@ def analyze(
         typer.echo("Stopped.", err=True)
         exit_code = _INTERRUPTED_EXIT_CODE
     raise typer.Exit(exit_code)
+
+
+def _block_length_of_long_session(session_file: Path) -> float | None:
+    """Return the length in s of the blocks of a session that is too long for one fit, or None."""
+    from analysis.record import may_be_longer
+    from rigd.session.limits import MAX_SAMPLES
+
+    if not may_be_longer(session_file, MAX_SAMPLES):
+        return None
+    from analysis.record_checks import RecordError
+    from analysis.record_part import BLOCK_S, blocks_of_session
+    from rigd.session import SessionError, read_summary
+
+    try:
+        if (read_summary(session_file).samples or 0) <= MAX_SAMPLES:
+            return None
+        blocks_of_session(session_file)
+    except (SessionError, RecordError):  # stated where the session is read
+        return None
+    return BLOCK_S
+
+
+def _check_block_option(block_s: float, files: Sequence[Path], *, has_part: bool) -> None:
+    """Raise a usage error if --block has no usable length, or is not for one whole session."""
+    usage_reason = None
+    if not 0.0 < block_s < math.inf:
+        usage_reason = f"{block_s:g} s must be more than 0."
+    elif len(files) > 1:
+        usage_reason = f"it takes one session, and {len(files)} files were given."
+    elif has_part:
+        usage_reason = "it divides the whole session; leave --from and --to out."
+    if usage_reason is not None:
+        raise typer.BadParameter(usage_reason, param_hint="--block")
 
 
 def _check_campaign_options(option_names: Sequence[str], files: Sequence[Path]) -> None:

@@ -37,6 +37,7 @@ def campaign_command(
     uniformity: float | None = None,
     with_paper: bool = False,
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
+    block_s: float | None = None,
 ) -> int:
     """Analyse a campaign, write its folder and its JSON, and print its tables.
 
@@ -66,6 +67,8 @@ def campaign_command(
         Whether the tables also show the paper's values.
     formats : sequence of str
         File formats of the figures.
+    block_s : float, optional
+        Length in seconds of the blocks into which the only session is divided.
 
     Returns
     -------
@@ -78,6 +81,8 @@ def campaign_command(
         None of the files could be used, or no workers are available.
     SingleSessionError
         Only one of the files could be used. Nothing was written.
+    SessionError, RecordError
+        The session cannot be divided into blocks.
     OutputExistsError, OutputError
         An output file cannot be written.
     """
@@ -87,14 +92,16 @@ def campaign_command(
     from analysis.report.folder import report_folders, write_new_file
 
     report_folder_source = (
-        files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_CAMPAIGN_NAME)
+        files[0]
+        if outputs.report is not None or block_s is not None
+        else files[0].with_name(_DEFAULT_CAMPAIGN_NAME)
     )
     (report_folder,) = report_folders(
         [report_folder_source], outputs.report, overwrite=outputs.overwrite
     )
     run_campaign = partial(
         campaign, files, settings, structures=structures, fixed_parameters=fixed, band_hz=band_hz,
-        jobs=jobs, dask_address=dask, uniformity=uniformity,
+        jobs=jobs, dask_address=dask, uniformity=uniformity, block_s=block_s,
     )  # fmt: skip
     campaign_result = _analyse_and_write(
         run_campaign, len(files), report_folder, outputs, with_paper=with_paper, formats=formats
@@ -157,6 +164,6 @@ def _analyse_and_write(
         print_error_line(f"Error: {session_failure.message}")
     for lost_trial in campaign_result.failed_predictions:
         print_error_line(
-            f"Error: {lost_trial.path} is not predicted from the others: {lost_trial.reason}"
+            f"Error: {lost_trial.source} is not predicted from the others: {lost_trial.reason}"
         )
     return campaign_result

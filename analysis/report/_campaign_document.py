@@ -51,7 +51,7 @@ def campaign_document(
             "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
             "files": [
                 {
-                    "file": str(session_analysis.path),
+                    **session_analysis.source.as_json(),
                     "validity": session_analysis.validity.as_json(),
                     "warnings": session_analysis.warnings,
                     "welch_segments": session_analysis.segments or None,
@@ -68,12 +68,12 @@ def campaign_document(
                 "asked": campaign.trials,
                 "done": campaign.trials - len(campaign.failed_predictions),
                 "lost": [
-                    {"file": str(trial.path), "reason": trial.reason}
+                    {**trial.source.as_json(), "reason": trial.reason}
                     for trial in campaign.failed_predictions
                 ],
             },
             "errors": [
-                {"file": str(failure.path), "message": failure.message}
+                {**failure.source.as_json(), "message": failure.message}
                 for failure in campaign.failures
             ],
             "fits": [
@@ -113,7 +113,7 @@ def _fit_identity_json(
 ) -> dict[str, Any]:
     """Return the entries that identify a session's fit: file, estimator, type and weighting."""
     return {
-        "file": str(session.path), "estimator": estimator, "type": structure_name,
+        **session.source.as_json(), "estimator": estimator, "type": structure_name,
         "weighting": None,
     }  # fmt: skip
 

@@ -114,7 +114,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
         ),
         (
             (
-                Cell(str(session.path), session.name),
+                Cell(str(session.source), session.name),
                 text_cell(experiment.start_utc if experiment else ""),
                 text_cell(experiment.specimen_label if experiment else ""),
                 text_cell(experiment.operator if experiment else ""),
@@ -158,7 +158,7 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
     """Return the table of every session's Welch fits, with the distance from the nominal models."""
     table_rows = [
         {
-            "file": str(session.path),
+            **session.source.as_json(),
             "type": model.fit.structure.name,
             "weighting": model.fit.weighting,
             **model.fit.parameters,
@@ -179,7 +179,7 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
     """Return the table of every session's whole-record fits."""
     table_rows = [
         {
-            "file": str(session.path),
+            **session.source.as_json(),
             "type": estimate.name,
             **estimate.fit.parameters,
             **{_std_key(name): std for name, std in estimate.fit.std_of_free_parameters.items()},
@@ -212,7 +212,7 @@ def validation_table(campaign: CampaignResult) -> Table:
     """
     table_rows: list[dict[str, Any]] = [
         {
-            "file": str(prediction.path),
+            **prediction.source.as_json(),
             "method": prediction.method,
             "type": prediction.name,
             "weighting": prediction.weighting,
@@ -226,7 +226,7 @@ def validation_table(campaign: CampaignResult) -> Table:
         for prediction in campaign.validation
     ]
     table_rows += [
-        {"file": str(failed_trial.path), "lost": failed_trial.reason}
+        {**failed_trial.source.as_json(), "lost": failed_trial.reason}
         for failed_trial in campaign.failed_predictions
     ]
     return _file_only_table("validation", table_rows)
@@ -286,14 +286,14 @@ def sessions_table(campaign: CampaignResult) -> Table:
         for file_name in group_files
     }
     structure_name = campaign.freest.name if campaign.freest else None
-    trials_by_path = {
-        prediction.path: prediction
+    trials_by_source = {
+        prediction.source: prediction
         for prediction in campaign.validation
         if (prediction.method, prediction.name) == ("record", structure_name)
     }
 
     def session_row(session: SessionAnalysis) -> tuple[Entry, ...]:
-        verdict, trial = session.verdict, trials_by_path.get(session.path)
+        verdict, trial = session.verdict, trials_by_source.get(session.source)
         own_error = trial.own_error if trial else None
         finding_kinds = [finding.kind for finding in verdict.findings] if verdict else []
         return (
@@ -314,8 +314,8 @@ def sessions_table(campaign: CampaignResult) -> Table:
         "Sessions, each by itself",
         (
             Column("file", "file", TEXT_FORMAT), Column("selects", "selected", TEXT_FORMAT),
-            Column("fit (NRMSE, %)" if trials_by_path else "", "nrmse_percent", ".2f"),
-            Column("leave-one-out error (%)" if trials_by_path else "", "error", ".2f", 100.0),
+            Column("fit (NRMSE, %)" if trials_by_source else "", "nrmse_percent", ".2f"),
+            Column("leave-one-out error (%)" if trials_by_source else "", "error", ".2f", 100.0),
             Column("residual", "left", TEXT_FORMAT),
             Column("other effects", "findings", TEXT_FORMAT),
             Column("group" if session_groups else "", "group", TEXT_FORMAT),
@@ -325,7 +325,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
             for row_cells in (*map(session_row, campaign.sessions), *excluded_rows)
         ),
         (
-            *((f"Fit and error: of type {structure_name}.",) if trials_by_path else ()),
+            *((f"Fit and error: of type {structure_name}.",) if trials_by_source else ()),
             *(
                 (f"Group: by the {label_and_unit(leading_quantity.quantity)[0]}.",)
                 if leading_quantity and session_groups

@@ -182,7 +182,7 @@ def _warning_texts(campaign: CampaignResult) -> list[str]:
     return [
         *(f"Left out: {failure.message}" for failure in campaign.failures),
         *(
-            f"Not predicted from the others: {lost_trial.path}: {lost_trial.reason}"
+            f"Not predicted from the others: {lost_trial.source}: {lost_trial.reason}"
             for lost_trial in campaign.failed_predictions
         ),
         *_session_warnings(campaign),
@@ -375,5 +375,6 @@ def _draw_example_signals(campaign: CampaignResult) -> Figure:
     from analysis.record import load_record
     from analysis.report._signal_figures import paper_signals_figure as signals_figure
 
-    record = load_record(campaign.sessions[0].path)
+    source = campaign.sessions[0].source
+    record = load_record(source.path, source.part_s)
     return signals_figure(analyse(record, replace(campaign.settings, types=())))

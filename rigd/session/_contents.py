@@ -11,7 +11,7 @@ from typing import BinaryIO, Final
 
 from rigd.session._errors import SessionAccessError, SessionError
 from rigd.session._mcap_limits import McapError, McapTooLargeError
-from rigd.session._mcap_reader import McapContents, OnBlock, read_mcap
+from rigd.session._mcap_reader import IsChunkNeeded, McapContents, OnBlock, read_mcap
 from rigd.session._mcap_writer import MAGIC
 from rigd.session._schema import SAMPLE_TOPIC
 from rigd.session._writer import PART_SUFFIX
@@ -29,6 +29,7 @@ def load_contents(
     on_block: OnBlock | None = None,
     is_salvage: bool = False,
     on_progress: Callable[[float], None] | None = None,
+    is_chunk_needed: IsChunkNeeded | None = None,
 ) -> McapContents:
     """Return the contents of an MCAP file up to its end or its first damage.
 
@@ -43,6 +44,7 @@ def load_contents(
             on_block=on_block,
             is_salvage=is_salvage,
             on_progress=on_progress,
+            is_chunk_needed=is_chunk_needed,
         )
 
 

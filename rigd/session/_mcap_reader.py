@@ -145,6 +145,10 @@ def message_starts(message_runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]
 OnBlock = Callable[[McapContents, MessageBlock], None]
 """Callback for each block of messages; its first argument is the contents read so far."""
 
+IsChunkNeeded = Callable[[McapContents, int, int], bool]
+"""Function that returns whether a chunk is read. Its arguments are the contents read so far, and
+the log times in nanoseconds of the first and the last message that the chunk states."""
+
 
 def read_mcap(
     file_data: memoryview,
@@ -153,13 +157,15 @@ def read_mcap(
     on_block: OnBlock | None = None,
     is_salvage: bool = False,
     on_progress: Callable[[float], None] | None = None,
+    is_chunk_needed: IsChunkNeeded | None = None,
 ) -> McapContents:
     """Read an MCAP file up to its end or its first damage.
 
     Pages of an ``mmap`` are released when they have been read. `on_block` is called with the
     messages of `topics` (None: all), block by block in the order of the file, before it is known
     whether the rest of the file is damaged. `on_progress` is called repeatedly with the fraction of
-    the file that was read, from 0 to 1.
+    the file that was read, from 0 to 1. Chunks for which `is_chunk_needed` is false are neither
+    decompressed nor checked, and then neither are the checksum and the statistics of the file.
 
     With `is_salvage`, read as much as possible: skip damaged records outside of chunks on which no
     message depends, and read the statistics of a damaged file. `McapContents.damage` states
@@ -175,7 +181,9 @@ def read_mcap(
             f"has {len(file_data) >> 20} MiB, more than the {limits.MAX_FILE_BYTES >> 20} MiB "
             "that are read"
         )
-    container_reader = _ContainerReader(file_data, topics, on_block, is_salvage=is_salvage)
+    container_reader = _ContainerReader(
+        file_data, topics, on_block, is_salvage=is_salvage, is_chunk_needed=is_chunk_needed
+    )
     mcap_contents = container_reader.contents
     mcap_contents.is_complete = _has_footer(file_data)
     try:
@@ -243,8 +251,11 @@ class _ContainerReader:
         on_block: OnBlock | None,
         *,
         is_salvage: bool,
+        is_chunk_needed: IsChunkNeeded | None,
     ) -> None:
         self.contents = McapContents(intact_bytes=len(MAGIC))
+        self._is_chunk_needed = is_chunk_needed
+        self._has_omitted_chunks = False
         self._is_salvage = is_salvage
         self._data = file_data
         self._topics = topics
@@ -308,7 +319,10 @@ class _ContainerReader:
 
     def _release_up_to(self, read_end: int) -> None:
         """Update the checksum of the data section up to an offset, and release memory before it."""
-        self._crc = self._crc_of_range(self._released_end, read_end, self._crc)
+        if self._has_omitted_chunks:  # then no checksum is verified
+            self._release_pages()
+        else:
+            self._crc = self._crc_of_range(self._released_end, read_end, self._crc)
         self._released_end = read_end
 
     def _crc_of_range(self, range_start: int, range_end: int, crc: int = 0) -> int:
@@ -406,10 +420,17 @@ class _ContainerReader:
 
     def _read_chunk(self, chunk_content: memoryview, chunk_position: int) -> None:
         """Decompress a chunk, verify its checksum, and read the records in it."""
-        self._budget.count_steps(READING_STEPS_PER_CHUNK)
         location_text = f" in the chunk at byte {chunk_position}"
         try:
-            *_, stated_size, stated_crc = _CHUNK_HEAD_FORMAT.unpack_from(chunk_content)
+            first_log_time, last_log_time, stated_size, stated_crc = _CHUNK_HEAD_FORMAT.unpack_from(
+                chunk_content
+            )
+            if self._is_chunk_needed is not None and not self._is_chunk_needed(
+                self.contents, first_log_time, last_log_time
+            ):
+                self._has_omitted_chunks = True
+                return
+            self._budget.count_steps(READING_STEPS_PER_CHUNK)
             compression_name, packed_position = read_prefixed_bytes(
                 chunk_content, _CHUNK_HEAD_FORMAT.size, "<I"
             )
@@ -617,6 +638,8 @@ class _ContainerReader:
             raise McapDamageError(
                 f"has a malformed end of its data section at byte {record_offset}"
             )
+        if self._has_omitted_chunks:
+            return
         (crc,) = struct.unpack_from("<I", record_content)
         if crc != 0 and crc != self._crc_of_range(self._released_end, record_offset, self._crc):
             raise McapDamageError("has a wrong checksum over its data section")
@@ -646,7 +669,7 @@ class _ContainerReader:
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 # A channel without messages may be declared in the summary only.
                 self._read_declaration(opcode, record_content, " in the summary")
-            elif opcode == Opcode.STATISTICS:
+            elif opcode == Opcode.STATISTICS and not self._has_omitted_chunks:
                 statistics = parse_record(Statistics.read, record_content, " in the summary")
                 read_message_counts = self.contents.message_counts
                 stated_message_counts = statistics.channel_message_counts

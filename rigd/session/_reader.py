@@ -14,7 +14,7 @@ import numpy.typing as npt
 from rigd.session import limits
 from rigd.session._contents import load_contents, recovery_advice
 from rigd.session._errors import SessionError
-from rigd.session._mcap_reader import McapContents, MessageBlock, OnBlock
+from rigd.session._mcap_reader import IsChunkNeeded, McapContents, MessageBlock, OnBlock
 from rigd.session._mcap_writer import MESSAGE_HEAD_FORMAT
 from rigd.session._message_decoder import (
     CONTROLS,
@@ -47,6 +47,10 @@ _MIN_ARRAY_GROWTH: Final = 1 << 16
 """Minimum number of messages by which the array of decoded messages grows."""
 _MIN_SAMPLE_RECORD_BYTES: Final = 60
 """Assumed minimum size of a sample in the file, in bytes after compression."""
+_PART_MARGIN_S: Final = 2.0
+"""Time in seconds before and after a part of a session of which chunks are read as well."""
+_MAX_CLOCK_DEVIATION: Final = 1e-3
+"""Maximum relative deviation of the time stamps from the number of ticks; it widens the margin."""
 _MAX_NUMBER_CHARACTERS: Final = 400
 """Maximum length of the text of a number; the longest finite number has 309 integer digits."""
 
@@ -131,6 +135,7 @@ def read_session(
     fields: Sequence[str] | None = None,
     max_samples: int = limits.MAX_SAMPLES,
     on_samples: Callable[[npt.NDArray[np.void]], None] | None = None,
+    part_s: tuple[float, float] | None = None,
 ) -> Session:
     """Read a complete session file: samples, metadata, log and attachments.
 
@@ -141,6 +146,9 @@ def read_session(
     max_samples : maximum number of samples, each of which takes up to 112 bytes of memory
     on_samples : called with each block of samples, with all fields, while the file is read; the
         returned session then has no samples
+    part_s : beginning and end of a part, in s since the session's start. Chunks of samples before
+        or after it, except those of the segment ``rest``, are neither read nor checked; the samples
+        near its ends may be outside the part. By default, all samples are read.
 
     Raises
     ------
@@ -178,7 +186,12 @@ def read_session(
         sample_buffer.decoder.add_block(mcap_contents, block)
         undecoded_log.add_block(mcap_contents, block)
 
-    mcap_contents = _load_intact_contents(path, (SAMPLE_TOPIC, EVENT_TOPIC), add_block)
+    mcap_contents = _load_intact_contents(
+        path,
+        (SAMPLE_TOPIC, EVENT_TOPIC),
+        add_block,
+        None if part_s is None else _chunks_of_part(part_s),
+    )
     metadata = merged_metadata(mcap_contents, "session") or {}
     format_version = metadata.get("format_version", FORMAT_VERSION)
     if format_version != FORMAT_VERSION:
@@ -408,9 +421,42 @@ class _UndecodedLog:
         return logged_events
 
 
-def _load_intact_contents(path: Path, topics: Sequence[str], on_block: OnBlock) -> McapContents:
+def _chunks_of_part(part_s: tuple[float, float]) -> IsChunkNeeded:
+    """Return the function that selects the chunks of a part of a session and of its rest.
+
+    The function selects every chunk of a file that does not state its rate and its start before the
+    samples.
+    """
+
+    def is_chunk_needed(contents: McapContents, first_log_time: int, last_log_time: int) -> bool:
+        metadata = merged_metadata(contents, "session") or {}
+        segments = merged_metadata(contents, "segments") or {}
+        try:
+            start_utc_ns = int(metadata["start_utc_ns"])
+            rest_end_s = int(segments.get("rest", "0,0").split(",")[1]) / float(metadata["rate_hz"])
+        except (KeyError, ValueError, ArithmeticError, IndexError):
+            return True
+        if not contents.channels:  # they may be declared in the first chunk alone
+            return True
+        first_s, last_s = (
+            (log_time - start_utc_ns) / 1e9 for log_time in (first_log_time, last_log_time)
+        )
+        margin_s = _PART_MARGIN_S + _MAX_CLOCK_DEVIATION * abs(last_s)
+        return first_s <= rest_end_s + margin_s or (
+            first_s <= part_s[1] + margin_s and last_s >= part_s[0] - margin_s
+        )
+
+    return is_chunk_needed
+
+
+def _load_intact_contents(
+    path: Path,
+    topics: Sequence[str],
+    on_block: OnBlock,
+    is_chunk_needed: IsChunkNeeded | None = None,
+) -> McapContents:
     """Return the contents of a session file; raise if it is incomplete or damaged."""
-    contents = load_contents(path, topics, on_block=on_block)
+    contents = load_contents(path, topics, on_block=on_block, is_chunk_needed=is_chunk_needed)
     if contents.damage is not None:
         raise SessionError(_damage_message(path, contents))
     if SAMPLE_TOPIC not in {channel.topic for channel in contents.channels.values()}:

@@ -20,6 +20,7 @@ from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper import FrfFit
 from analysis.paper.welch_analysis import FitIndices, FittedModel, Peak
 from analysis.record import load_record
+from analysis.record_part import RecordSource
 from rigd.beam import Beam, Damping, Plant
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 
@@ -89,12 +90,12 @@ def done(short_sessions, other_beam, settings, tmp_path_factory, computed_once):
         def run(self, function, tasks, on_done):
             if function is not analyse_session:
                 return super().run(function, tasks, on_done)
-            *to_analyse, (path, _) = tasks
-            assert path == other_beam
+            *to_analyse, (source, _) = tasks
+            assert source.path == other_beam
             found = super().run(function, to_analyse, on_done)
             on_done(len(to_analyse))
-            experiment = Experiment.from_record(load_record(path))
-            return [*found, replace(found[0], path=path, experiment=experiment)]
+            experiment = Experiment.from_record(load_record(other_beam))
+            return [*found, replace(found[0], source=source, experiment=experiment)]
 
     def compute():
         torn = tmp_path_factory.mktemp("torn") / "torn.mcap"
@@ -222,7 +223,7 @@ def session_result(
 ):
     response = np.array(response)
     return SessionAnalysis(
-        path=Path(name),
+        source=RecordSource(Path(name)),
         experiment=experiment(name),
         beam=LINK,
         tool_inertia_kg_m2=0.0,

@@ -14,6 +14,7 @@ from analysis.campaigns.workers import process_pool
 from analysis.identify import BAND_HZ, Measurement, fit_record
 from analysis.models import STRUCTURES
 from analysis.record import load_record
+from analysis.record_part import RecordSource
 from analysis.report import campaign_document
 from analysis.report._campaign_tables import (
     all_tables,
@@ -46,7 +47,7 @@ def test_order_of_sessions_and_failures_are_reported(done, short_sessions, other
 def test_workers_agree_with_this_process(done, short_sessions, settings):
     task = SessionTask(settings, ("I", "III"), (), None)
     with process_pool(1) as pool:
-        (there,) = pool.run(analyse_session, [(short_sessions[2], task)])
+        (there,) = pool.run(analyse_session, [(RecordSource(short_sessions[2]), task)])
     here = done[0].sessions[2]
     assert np.array_equal(here.response, there.response)
     for one, two in zip(here.welch_models, there.welch_models, strict=True):
@@ -106,7 +107,7 @@ def test_error_of_a_prediction_is_that_of_the_torque(done, short_sessions, truth
     true = replace(forecast, plant=Plant(link, damping), own_plant=None)
     light = replace(link, density_kg_per_m=1e-12, bending_stiffness_n_m2=1e-12)
     none = replace(true, plant=Plant(light, damping))
-    exact, nothing = leave_one_out_results(short_sessions[0], [true, none], BAND_HZ)
+    exact, nothing = leave_one_out_results(RecordSource(short_sessions[0]), [true, none], BAND_HZ)
     best = min(e.own_error for e in found.validation if e.own_error is not None)
     assert exact.error == pytest.approx(best, rel=0.1)
     assert nothing.error == pytest.approx(1.0, abs=1e-6)
@@ -370,7 +371,9 @@ def test_fit_and_leave_one_out_error_are_in_one_table(done):
     nominal = [replace(each, method="welch", name="VI", own_error=None) for each in of_three]
     more = replace(found, validation=(*found.validation, *nominal))
     session, *_ = sessions_table(more).rows
-    (trial,) = (e for e in found.validation if (e.path, e.name) == (found.sessions[0].path, "VI"))
+    (trial,) = (
+        e for e in found.validation if (e.source, e.name) == (found.sessions[0].source, "VI")
+    )
     assert session["nrmse_percent"] == pytest.approx(100 * (1 - trial.own_error))
     assert session["error"] == trial.error
 
@@ -383,7 +386,7 @@ def test_fit_equals_that_of_a_single_report(done, short_sessions):
     (trial,) = (
         each
         for each in found.validation
-        if (each.path, each.method, each.name) == (short_sessions[0], "record", "III")
+        if (each.source.path, each.method, each.name) == (short_sessions[0], "record", "III")
     )
     (fit,) = analysis.fits
     assert 100 * (1 - trial.own_error) == pytest.approx(analysis.fit_percent(fit), abs=0.2)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from analysis.campaigns import SessionFailure, SessionTask, analyse_session
+from analysis.record_part import RecordSource
 
 pytestmark = pytest.mark.fit
 
@@ -82,9 +83,11 @@ def test_other_experiment_is_reported_before_a_failed_analysis(
 ):
     """A hold is too short for a Welch segment, but that is not why it does not belong here."""
     hold = SessionFailure(
-        Path("hold.mcap"), "too short, --segment 1439", make_experiment("hold", excitation="hold")
+        RecordSource(Path("hold.mcap")),
+        "too short, --segment 1439",
+        make_experiment("hold", excitation="hold"),
     )
-    torn = SessionFailure(Path("torn.mcap"), "torn.mcap is incomplete.")
+    torn = SessionFailure(RecordSource(Path("torn.mcap")), "torn.mcap is incomplete.")
     sessions, failures = of_one_experiment([chirps("0.mcap"), hold, torn])
     assert len(sessions) == 1
     assert "excitation is hold, but chirp" in failures[0].message
@@ -93,7 +96,9 @@ def test_other_experiment_is_reported_before_a_failed_analysis(
 
 def test_no_session_counts_twice(of_one_experiment, chirps):
     one, other = chirps("0.mcap"), chirps("1.mcap")
-    sessions, (failure,) = of_one_experiment([one, other, replace(one, path=Path("copy.mcap"))])
+    sessions, (failure,) = of_one_experiment(
+        [one, other, replace(one, source=RecordSource(Path("copy.mcap")))]
+    )
     assert [each.path for each in sessions] == [one.path, other.path]
     assert "copy.mcap: it is the same session as 0.mcap" in failure.message
 
@@ -113,7 +118,7 @@ def test_session_stopped_within_its_sweep_is_left_out(make_experiment):
 def test_stopped_session_is_not_reported_as_short(make_file, settings, tmp_path):
     """20 s of sweep where the file states 120 s."""
     path = make_file(tmp_path / "stopped.mcap", 0, duration_s="120.0", excitation="chirp")
-    failure = analyse_session(path, SessionTask(settings, (), (), None))
+    failure = analyse_session(RecordSource(path), SessionTask(settings, (), (), None))
     assert "stopped.mcap: its sweep ended after 20 s of 120 s" in failure.message
     assert failure.experiment.facts["excitation"] == "chirp"
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from analysis.campaigns import SessionFailure, campaign, specimen_sentences
+from analysis.record_part import RecordSource
 from analysis.report import campaign_document
 from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 from rigd.beam import undamped_frequencies_rad_s
@@ -125,7 +126,7 @@ def test_files_are_grouped_by_stated_specimen(make_session, make_experiment, cam
         replace(make_session(name), experiment=make_experiment(name, tool_inertia_kg_m2=inertia))
         for name, inertia in (("a", 0.0), ("b", 1e-5), ("c", 0.0))
     ]
-    torn = SessionFailure(Path("torn"), "torn is incomplete.")
+    torn = SessionFailure(RecordSource(Path("torn")), "torn is incomplete.")
     found = campaign_of([*results[:2], torn, results[2]]).homogeneity
     first, second = found.specimens
     assert (first.file_names, second.file_names) == (("a", "c"), ("b",))

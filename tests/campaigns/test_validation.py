@@ -26,9 +26,9 @@ class OneLost:
 
     def run(self, _function, tasks, on_done):
         found = []
-        for number, (function, path, *arguments) in enumerate(tasks):
-            lost = path.name == "1.mcap"
-            found.append(FailedTask(REASON) if lost else function(path, *arguments))
+        for number, (function, source, *arguments) in enumerate(tasks):
+            lost = source.path.name == "1.mcap"
+            found.append(FailedTask(REASON) if lost else function(source, *arguments))
             on_done(number)
         return found
 
@@ -43,7 +43,7 @@ class Shaken:
         if function is analyse_session:
             for number, _ in enumerate(tasks):
                 on_done(number)
-            return [self._results[path] for path, _ in tasks]
+            return [self._results[source.path] for source, _ in tasks]
         return self._pool.run(call_unless_one, [(function, *task) for task in tasks], on_done)
 
 
@@ -65,9 +65,9 @@ def shaken(request, short_sessions, settings, done):
 def test_killed_worker_loses_its_trial_only(shaken):
     assert shaken.failures == ()
     (lost,) = shaken.failed_predictions
-    assert (lost.path.name, shaken.trials) == ("1.mcap", 4)
+    assert (lost.source.path.name, shaken.trials) == ("1.mcap", 4)
     assert lost.reason.startswith(REASON)
-    assert {each.path.name for each in shaken.validation} == {"0.mcap", "2.mcap", "3.mcap"}
+    assert {each.source.path.name for each in shaken.validation} == {"0.mcap", "2.mcap", "3.mcap"}
 
 
 @pytest.mark.process
@@ -88,7 +88,9 @@ def test_terminal_page_and_files_report_the_lost_trial(shaken):
     assert "3 of 4" in row
     page = campaign_page(shaken, (), datetime.now(UTC), with_paper_values=False)
     assert "3 of 4" in page
-    assert f"Not predicted from the others: {shaken.failed_predictions[0].path}: its worker" in page
+    assert (
+        f"Not predicted from the others: {shaken.failed_predictions[0].source}: its worker" in page
+    )
     content = campaign_document(shaken)
     trials = content["trials"]
     assert trials["asked"] == trials["done"] + len(trials["lost"]) == 4
@@ -136,7 +138,11 @@ def test_results_remain_if_all_workers_are_lost(make_session):
 
     found = campaign([each.path for each in sessions], workers=Going())
     assert found.validation == ()
-    assert [each.path.name for each in found.failed_predictions] == ["0.mcap", "1.mcap", "2.mcap"]
+    assert [each.source.path.name for each in found.failed_predictions] == [
+        "0.mcap",
+        "1.mcap",
+        "2.mcap",
+    ]
     assert {each.reason for each in found.failed_predictions} == {"The Dask scheduler went away."}
 
 

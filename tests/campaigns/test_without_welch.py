@@ -10,6 +10,7 @@ import pytest
 
 from analysis.campaigns import SessionFailure, SessionTask, analyse_session
 from analysis.models import WelchSettings
+from analysis.record_part import RecordSource
 from analysis.report.campaign_report import campaign_page, campaign_text, write_campaign
 
 pytestmark = pytest.mark.fit
@@ -22,10 +23,15 @@ def found(make_file, tmp_path_factory, campaign_of):
         tmp_path_factory.mktemp("multisine") / "0.mcap", 0, excitation="multisine", specimen="A",
         operator="Eve", note="[clamp] <b>new</b>",
     )  # fmt: skip
-    first = analyse_session(path, SessionTask(WelchSettings(types=("I",)), ("III",), (), None))
+    first = analyse_session(
+        RecordSource(path), SessionTask(WelchSettings(types=("I",)), ("III",), (), None)
+    )
     experiment = replace(first.experiment, session_identifiers=("1.mcap",))
     other = replace(
-        first, path=path.with_name("1.mcap"), experiment=experiment, sample_digests=frozenset()
+        first,
+        source=RecordSource(path.with_name("1.mcap")),
+        experiment=experiment,
+        sample_digests=frozenset(),
     )
     return campaign_of([first, other], structures=("III",))
 
@@ -75,7 +81,8 @@ def test_sessions_are_listed_with_their_metadata(found):
 def test_odd_session_is_set_aside_without_affecting_others(make_session, campaign_of):
     sessions = [make_session(f"{number}.mcap") for number in range(3)]
     odd = replace(
-        sessions[0].without_welch(), path=Path("odd.mcap"), warnings=("Welch fits left out: x.",),
+        sessions[0].without_welch(), source=RecordSource(Path("odd.mcap")),
+        warnings=("Welch fits left out: x.",),
         experiment=replace(sessions[0].experiment, session_identifiers=("odd",)),
     )  # fmt: skip
     found = campaign_of([*sessions, odd])
@@ -92,7 +99,7 @@ def test_search_with_chirps_counts_and_disables_welch(make_session, make_experim
     chirps = [make_session(f"{number}.mcap") for number in range(3)]
     search = replace(
         chirps[0].without_welch(),
-        path=Path("until.mcap"),
+        source=RecordSource(Path("until.mcap")),
         experiment=make_experiment("until.mcap", excitation="until"),
     )
     found = campaign_of([*chirps, search])
@@ -108,7 +115,7 @@ def test_a_session_with_a_wrong_unit_is_set_aside(make_file, tmp_path, settings)
         "beam_bending_stiffness_n_m2": repr(0.090275 * math.pi / 180),
     }
     path = make_file(tmp_path / "degrees.mcap", 7, **beam)
-    found = analyse_session(path, SessionTask(settings, ("III",), (), None))
+    found = analyse_session(RecordSource(path), SessionTask(settings, ("III",), (), None))
     assert isinstance(found, SessionFailure)
     assert "degrees for radians" in found.message
     assert found.experiment is not None

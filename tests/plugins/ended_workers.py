@@ -3,11 +3,11 @@
 import os
 
 
-def call_unless_one(function, path, *arguments):
+def call_unless_one(function, source, *arguments):
     """Call a function, but end the process that is given 1.mcap, as lack of memory does."""
-    if path.name == "1.mcap":
+    if source.path.name == "1.mcap":
         os._exit(9)
-    return function(path, *arguments)
+    return function(source, *arguments)
 
 
 def end_at_zero(number):
