@@ -300,7 +300,7 @@ def load_record(
 
     read_session(
         path,
-        max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
+        max_samples=limits.MAX_RECORDED_SAMPLES,
         on_samples=add_samples,
         part_s=interval_s,
     )
@@ -321,7 +321,7 @@ def _read_ticks(
     The second result is the interval in s whose chunks were read; None for all of them.
     """
     read_ticks = partial(
-        read_session, path, fields=_TICK_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+        read_session, path, fields=_TICK_FIELDS, max_samples=limits.MAX_RECORDED_SAMPLES
     )
     if part_s is not None:
         interval_s = (part_s[0] or 0.0, math.inf if part_s[1] is None else part_s[1])

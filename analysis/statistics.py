@@ -122,6 +122,27 @@ def student_t_quantile(confidence_level: float, degrees_of_freedom: float) -> fl
     return float(stdtrit(degrees_of_freedom, (1 + confidence_level) / 2))
 
 
+def student_t_p_value(statistic: float, degrees_of_freedom: float) -> float:
+    """Return the probability that Student's t is at least as far from 0 as `statistic`.
+
+    Parameters
+    ----------
+    statistic : float
+        Value of the variable.
+    degrees_of_freedom : float
+        Degrees of freedom, above 0.
+
+    Examples
+    --------
+    >>> from analysis.statistics import student_t_p_value
+    >>> round(student_t_p_value(-2.262, 9), 3)
+    0.05
+    """
+    from scipy.special import stdtr
+
+    return 2 * float(stdtr(degrees_of_freedom, -abs(statistic)))
+
+
 def nrmse_percent(residual: NDArray[Any], measured: NDArray[Any]) -> float:
     """Return the fit in %, as ``compare`` of MATLAB's System Identification Toolbox defines it.
 

@@ -93,6 +93,8 @@ class Experiment:
         Identifiers of the session, equal in copies of its file; the path of a file without them.
     start_utc : str
         Start of the recording in UTC, to the second; empty if the file does not state it.
+    middle_utc_s : float or None
+        Middle of the record in seconds since 1970; None if the file does not state its start.
     operator, note : str
         Operator and note stated in the file; empty if not stated.
     added_metadata : mapping of str to (float or str)
@@ -103,6 +105,7 @@ class Experiment:
     sweep_s: float
     session_identifiers: tuple[str, ...]
     start_utc: str = ""
+    middle_utc_s: float | None = None
     operator: str = ""
     note: str = ""
     added_metadata: Mapping[str, float | str] = field(default_factory=dict)
@@ -135,6 +138,7 @@ class Experiment:
                 *(() if record.part_text is None else (record.part_text,)),
             ),
             start_utc=_utc_text(metadata.get("start_utc_ns", "")),
+            middle_utc_s=_middle_utc_s(record),
             operator=metadata.get("operator", "").strip(),
             note=metadata.get("note", "").strip(),
             added_metadata=added_metadata(metadata),
@@ -384,6 +388,14 @@ def _utc_text(utc_ns: str) -> str:
         return f"{datetime.fromtimestamp(int(utc_ns) // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}"
     except (ValueError, OverflowError, OSError):
         return ""
+
+
+def _middle_utc_s(record: Record) -> float | None:
+    """Return the middle of a record in seconds since 1970; None if its start is not stated."""
+    start_utc_ns = record.metadata.get("start_utc_ns", "")
+    if not (start_utc_ns.isascii() and start_utc_ns.isdigit()):
+        return None
+    return int(start_utc_ns) / 1e9 + float(record.time_s[0] + record.time_s[-1]) / 2
 
 
 def _parse_number(number_text: str) -> str | float:

@@ -12,17 +12,18 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.campaigns._trend import Trend, linear_trend
 from analysis.campaigns.pooling import common_structure, freest_estimate, random_effects
 from analysis.statistics import chi_square_p_value
 from rigd.beam import LOGARITHMIC_PARAMETERS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -75,6 +76,10 @@ class Heterogeneity:
         Whether the sessions differ so much that the mean is that of a mixture of specimens.
     session_groups : tuple of tuple of str
         Files of each group of sessions, by increasing value; empty without clear gaps.
+    trend : Trend or None
+        Change with time; None if there are too few sessions, or their times are unknown.
+    has_significant_trend : bool
+        Whether the change with time is significant.
     """
 
     quantity: str
@@ -85,6 +90,8 @@ class Heterogeneity:
     p_value: float
     is_mixture: bool
     session_groups: tuple[tuple[str, ...], ...]
+    trend: Trend | None = None
+    has_significant_trend: bool = False
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -120,11 +127,14 @@ class Homogeneity:
     structure : str or None
         Damping structure whose parameters are compared between sessions, as named in tables; None
         if there are no whole-record fits.
+    is_one_session : bool
+        Whether the sessions are blocks of one session, which cannot be of different specimens.
     """
 
     specimens: tuple[StatedSpecimen, ...]
     quantities: tuple[Heterogeneity, ...]
     structure: str | None = None
+    is_one_session: bool = False
 
     @property
     def leading_scatter(self) -> Heterogeneity | None:
@@ -183,7 +193,8 @@ def homogeneity(
         for estimate in session.record_estimates
         if estimate.name == structure_name
     ]
-    values_by_quantity = dict(_mode_values(common_estimates))
+    modal_values = dict(_modal_values(sessions))
+    values_by_quantity = modal_values or dict(_mode_values(common_estimates))
     freest_fit = freest_estimate(pooled_fits)
     if freest_fit is not None:
         values_by_quantity |= dict(_parameter_values(sessions, freest_fit))
@@ -193,20 +204,51 @@ def homogeneity(
         if len(quantity_values) >= _MIN_COMPARED_SESSIONS
     }
     significance_level = SIGNIFICANCE_LEVEL / max(len(values_by_quantity), 1)
+    times_s = {session.name: session.experiment.middle_utc_s for session in sessions}
     return Homogeneity(
         tuple(specimens),
         tuple(
-            _test_heterogeneity(quantity, quantity_values, significance_level)
+            _with_trend(
+                _test_heterogeneity(quantity, quantity_values, significance_level),
+                times_s,
+                significance_level,
+            )
             for quantity, quantity_values in values_by_quantity.items()
         ),
         structure_name,
+        is_one_session=all(session.source.part_s is not None for session in sessions)
+        and len({session.path for session in sessions}) == 1,
     )
+
+
+def _modal_values(sessions: Sequence[SessionAnalysis]) -> Iterator[tuple[str, SessionEstimates]]:
+    """Yield name and session values of each quantity of the modes that sessions show.
+
+    They are of the modal model, which assumes no damping structure.
+    """
+    session_modes = [
+        (session.name, mode_number, session.modal.mode(mode_number))
+        for session in sessions
+        if session.modal is not None
+        for mode_number in session.modal.visible_mode_numbers
+    ]
+    for quantity, std in _MODE_QUANTITIES.items():
+        for visible_number in sorted({mode_number for _, mode_number, _ in session_modes}):
+            session_estimates = (
+                (file_name, getattr(mode, quantity), getattr(mode, std))
+                for file_name, mode_number, mode in session_modes
+                if mode_number == visible_number
+            )
+            yield f"{quantity}_{visible_number}", _drop_unknown_std(session_estimates)
 
 
 def _mode_values(
     estimates: Sequence[tuple[str, RecordEstimate]],
 ) -> Iterator[tuple[str, SessionEstimates]]:
-    """Yield name and session values of each quantity of the modes that all sessions have."""
+    """Yield name and session values of each quantity of the modes that all sessions have.
+
+    They are of a uniform beam, for sessions without a modal model.
+    """
     mode_count = min((len(estimate.fit.modes) for _, estimate in estimates), default=0)
     for quantity, std in _MODE_QUANTITIES.items():
         for mode_index in range(mode_count):
@@ -224,7 +266,10 @@ def _mode_values(
 def _parameter_values(
     sessions: Sequence[SessionAnalysis], freest_fit: PooledEstimate
 ) -> Iterator[tuple[str, SessionEstimates]]:
-    """Yield name and session values of each pooled parameter."""
+    """Yield name and session values of each pooled parameter.
+
+    Values that a session's own report does not give, or gives with a flag, are not compared.
+    """
     for parameter in freest_fit.parameters:
         parameter_name = parameter.name
         session_estimates = (
@@ -234,10 +279,28 @@ def _parameter_values(
                 estimate.fit.std[parameter_name] or 0.0,
             )
             for session in sessions
+            if _is_reported(session, freest_fit.name, parameter_name)
             for estimate in session.record_estimates
             if estimate.name == freest_fit.name and parameter_name in estimate.fit.determined
         )
         yield parameter_name, _drop_unknown_std(session_estimates)
+
+
+def _is_reported(session: SessionAnalysis, structure_name: str, parameter_name: str) -> bool:
+    """Return whether a session's own report gives a parameter of a structure without a flag.
+
+    If an order is not identifiable, the other parameters of the structure depend on its value.
+    """
+    headline = session.headline
+    if headline is None or headline["type"] != structure_name:
+        return True
+    if any(order["status"] == "not identifiable" for order in headline["orders"].values()):
+        return False
+    return not any(
+        estimates["parameters"][parameter_name]["flag"]
+        for estimates in (headline, headline["exact_geometry"])
+        if estimates is not None and parameter_name in estimates["parameters"]
+    )
 
 
 def _drop_unknown_std(session_estimates: Iterator[tuple[str, float, float]]) -> SessionEstimates:
@@ -275,6 +338,19 @@ def _test_heterogeneity(
             tuple(session_estimates[session_index][0] for session_index in sorted(group))
             for group in session_groups
         ),
+    )
+
+
+def _with_trend(
+    scatter: Heterogeneity, times_s: Mapping[str, float | None], significance_level: float
+) -> Heterogeneity:
+    """Return the scatter of a quantity with its change with time, tested at a level."""
+    file_names, estimates, stds = zip(*scatter.session_estimates, strict=True)
+    trend = linear_trend([times_s[file_name] for file_name in file_names], estimates, stds)
+    return replace(
+        scatter,
+        trend=trend,
+        has_significant_trend=trend is not None and trend.p_value < significance_level,
     )
 
 

@@ -258,6 +258,8 @@ def campaign_verdict(
         sentences=(
             *specimen_sentences.describe_specimens(homogeneity),
             sentences.describe_orders(freest_fit, alpha, lambda_, validation),
+            *specimen_sentences.describe_blocks(homogeneity, len(sessions)),
+            *specimen_sentences.describe_trends(homogeneity),
             *_describe_parameters(
                 freest_fit, lowest_bic_estimate, modal_model, adequate_session_count, len(verdicts)
             ),

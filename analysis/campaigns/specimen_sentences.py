@@ -1,4 +1,4 @@
-"""Sentences on the specimens of a campaign: whether its sessions are of one or of several."""
+"""Sentences on the specimens of a campaign: whether its sessions agree, or change with time."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._experiment import differing_fact_keys, fact_text
-from analysis.campaigns.labels import format_percent, join_first_texts, label_and_unit
-from rigd.units import decimals
+from analysis.campaigns.labels import (
+    format_p_value,
+    format_percent,
+    join_first_texts,
+    label_and_unit,
+)
+from rigd.units import decimals, rounded_to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,6 +51,56 @@ def describe_specimens(homogeneity: Homogeneity) -> list[str]:
         if leading_scatter is None
         else [*sentences, *_describe_different_specimens(homogeneity, leading_scatter)]
     )
+
+
+def describe_blocks(homogeneity: Homogeneity, block_count: int) -> list[str]:
+    """Return a sentence that the sessions are blocks of one session, or an empty list."""
+    if not homogeneity.is_one_session:
+        return []
+    return [f"The session is divided into {block_count} blocks. Here, each block is a session."]
+
+
+def describe_trends(homogeneity: Homogeneity) -> list[str]:
+    """Return a sentence on the quantities that change with time, or an empty list.
+
+    That nothing changes is stated of the blocks of one session only.
+    """
+    trends = [scatter.trend for scatter in homogeneity.quantities if scatter.trend is not None]
+    if not trends:
+        return []
+    covered_text = f"over {max(trend.covered_h for trend in trends):.3g} h"
+    changing_quantities = [
+        scatter for scatter in homogeneity.quantities if scatter.has_significant_trend
+    ]
+    if changing_quantities:
+        slopes_text = "; ".join(map(_slope_text, changing_quantities))
+        return [
+            f"Change with time {covered_text} (straight lines, 95 %): {slopes_text}. Pooled values "
+            "are means over this time."
+        ]
+    if not homogeneity.is_one_session:
+        return []
+    lowest_p_value = min(trend.p_value for trend in trends)
+    first_quantity = next(
+        scatter for scatter in homogeneity.quantities if scatter.trend is not None
+    )
+    return [
+        f"No significant change with time {covered_text} (straight lines, lowest p of "
+        f"{len(trends)}: {format_p_value(lowest_p_value)}): {_slope_text(first_quantity)}."
+    ]
+
+
+def _slope_text(scatter: Heterogeneity) -> str:
+    """Describe the change of a quantity per hour, with its 95 % interval as a half width."""
+    assert scatter.trend is not None
+    quantity_label, factor, display_unit = label_and_unit(scatter.quantity)
+    half_width = (scatter.trend.interval_95_per_h[1] - scatter.trend.interval_95_per_h[0]) / 2
+    slope_text, half_width_text = rounded_to_uncertainty(
+        (scatter.trend.slope_per_h, half_width), half_width, factor
+    )
+    sign_text = "+" if scatter.trend.slope_per_h > 0 else ""
+    unit_text = f" {display_unit}" if display_unit else ""
+    return f"{quantity_label} by {sign_text}{slope_text} ± {half_width_text}{unit_text} per hour"
 
 
 def pooled_title(title_text: str, homogeneity: Homogeneity) -> str:
@@ -95,10 +150,19 @@ def _describe_different_specimens(
     other_quantities_sentence = (
         f" The same holds for {', '.join(other_labels)}." if other_labels else ""
     )
+    groups_sentence = _describe_groups(leading_scatter)
+    if homogeneity.is_one_session:
+        return [
+            "The antenna did not stay in one state during the session: "
+            f"{_describe_heterogeneity(leading_scatter)}.{other_quantities_sentence}",
+            f"{groups_sentence} Pooled values are then means over several states (marked "
+            f"{MIXTURE_MARK}): find what changed during the session (clamp, temperature, "
+            f"wear).{_small_scatter_remark(homogeneity)}",
+        ]
     return [
         "The sessions are not of one specimen in one state: "
         f"{_describe_heterogeneity(leading_scatter)}.{other_quantities_sentence}",
-        f"{_describe_groups(leading_scatter)} Pooled values are then means of a mixture (marked "
+        f"{groups_sentence} Pooled values are then means of a mixture (marked "
         f"{MIXTURE_MARK}) that "
         "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
         "find what changed between sessions (clamp, temperature, "

@@ -519,9 +519,11 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
                 number_cell(scatter.i_squared), text=format_percent(scatter.i_squared)
             ),
             "p_value": p_value_cell(scatter.p_value),
+            **_trend_cells(scatter, display_factor),
             "mixture": scatter.is_mixture,
         }
 
+    has_trends = any(scatter.trend for scatter in homogeneity.quantities)
     return Table(
         "homogeneity",
         "Homogeneity of the sessions"
@@ -532,15 +534,39 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
             Column("τ/s", "between_in_own_std", ".3g"),
             Column("Cochran's Q", "cochran_q", ".3g"),
             Column("I²", "i_squared"), Column("p", "p_value"),
+            Column("change per hour" if has_trends else "", "trend_per_h"),
+            Column("std" if has_trends else "", "trend_std_per_h", std_of_previous=True),
+            Column("its p" if has_trends else "", "trend_p_value"),
         ),
         tuple(map(scatter_row, homogeneity.quantities)),
         (
             "Between sessions: standard deviation beyond the sessions' own uncertainties (τ). τ/s: "
             "the same over a typical session's own. I²: its share of the variance. p: p-value of "
             "Cochran's Q.",
+            *(
+                ["Change per hour: slope of a straight line. Its p: p-value of no change."]
+                if has_trends
+                else []
+            ),
             *([MIXTURE_NOTE] if homogeneity.is_mixture else []),
         ),
     )  # fmt: skip
+
+
+def _trend_cells(scatter: Heterogeneity, display_factor: float) -> Row:
+    """Return the cells of the change of a quantity with time; they are empty if it is unknown."""
+    if scatter.trend is None:
+        return {}
+    slope_cell, std_cell = estimate_cells(
+        (scatter.trend.slope_per_h, scatter.trend.slope_std_per_h),
+        scatter.trend.slope_std_per_h,
+        display_factor,
+    )
+    return {
+        "trend_per_h": slope_cell,
+        "trend_std_per_h": std_cell,
+        "trend_p_value": p_value_cell(scatter.trend.p_value),
+    }
 
 
 def _decimals_of_scatter(scatter: Heterogeneity) -> int:

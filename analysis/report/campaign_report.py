@@ -11,7 +11,11 @@ from rich.console import Group
 from rich.text import Text
 
 from analysis.campaigns.sentences import describe_failed_predictions
-from analysis.campaigns.specimen_sentences import describe_specimens
+from analysis.campaigns.specimen_sentences import (
+    describe_blocks,
+    describe_specimens,
+    describe_trends,
+)
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
@@ -60,6 +64,8 @@ def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     has_estimates = any(session.record_estimates for session in campaign.sessions)
     return (
         *describe_specimens(campaign.homogeneity),
+        *describe_blocks(campaign.homogeneity, len(campaign.sessions)),
+        *describe_trends(campaign.homogeneity),
         *([_NO_VERDICT_SENTENCE] if has_estimates else []),
         *describe_failed_predictions(campaign.failed_predictions, campaign.trials),
     )
@@ -124,7 +130,7 @@ def campaign_text(campaign: CampaignResult, *, with_paper_values: bool = False) 
 
 # Page
 
-_WHOLE_RECORD_FIGURES: Final = ("damping", "pooled_response", "pooled", "validation")
+_WHOLE_RECORD_FIGURES: Final = ("trends", "damping", "pooled_response", "pooled", "validation")
 """Names of the whole-record fits' figures, which follow the verdict on the page. The other figures
 correspond to the reference paper's."""
 
@@ -160,9 +166,13 @@ def campaign_page(
     all_sentences = campaign_sentences(campaign)
     return render_page(
         "campaign.html",
-        title=f"Campaign of {len(session_paths)} sessions",
+        title=f"{len(session_paths)} blocks of a session"
+        if campaign.homogeneity.is_one_session
+        else f"Campaign of {len(session_paths)} sessions",
         files=f"{session_paths[0].name} to {session_paths[-1].name}, "
-        f"in {session_paths[0].absolute().parent}",
+        f"in {session_paths[0].absolute().parent}"
+        if len(set(session_paths)) > 1
+        else str(session_paths[0].absolute()),
         first=all_sentences[:1],
         sentences=all_sentences[1:],
         experiments=campaign.verdict.experiments if campaign.verdict else (),
@@ -318,7 +328,18 @@ def _illustrations(campaign: CampaignResult) -> Iterator[Illustration]:
     )
     from analysis.report._pooled_figures import damping_figure, response_figure
     from analysis.report._style import Illustration
+    from analysis.report._trend_figure import trend_figure
 
+    scatters = campaign.homogeneity.quantities
+    if any(scatter.has_significant_trend for scatter in scatters) or (
+        campaign.homogeneity.is_one_session and any(scatter.trend for scatter in scatters)
+    ):
+        yield Illustration(
+            "trends",
+            partial(trend_figure, campaign),
+            "Modes and parameters of each session against time, with 95 % intervals; straight "
+            "lines where the change with time is significant.",
+        )
     if campaign.freest is not None and campaign.modes:
         yield Illustration(
             "damping",

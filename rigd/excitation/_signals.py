@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rigd.errors import UserError
 from rigd.excitation._options import RestS, RingDownS, documented
 from rigd.session import linear_sweep_band_hz, sweep_frequency_hz
-from rigd.session.limits import MAX_SAMPLES
+from rigd.session.limits import MAX_RECORDED_SAMPLES, MAX_SAMPLES
 from rigd.units import is_usable_size
 
 if TYPE_CHECKING:
@@ -204,18 +204,28 @@ def require_frequency(
 
 
 def lay_out_segments(
-    rate_hz: float, rest_s: float, duration_s: float, ring_down_s: float
+    rate_hz: float,
+    rest_s: float,
+    duration_s: float,
+    ring_down_s: float,
+    *,
+    max_samples: int = MAX_SAMPLES,
 ) -> dict[str, tuple[int, int]]:
     """Return the first tick and the tick after the last of rest, sweep and ring-down, by name.
 
-    The times are rounded to ticks, and the rounding changes the length of the ring-down only.
+    The times are rounded to ticks, and the rounding changes the length of the ring-down only. More
+    than `max_samples` are refused.
     """
     require_not_negative("rest_s", rest_s)
     require_positive("duration_s", duration_s, "s")
     require_not_negative("ring_down_s", ring_down_s)
     rest_and_ring_down_s = rest_s + ring_down_s
     check_ticks(
-        "The session", (duration_s + rest_and_ring_down_s) * rate_hz, rate_hz, rest_and_ring_down_s
+        "The session",
+        (duration_s + rest_and_ring_down_s) * rate_hz,
+        rate_hz,
+        rest_and_ring_down_s,
+        max_samples=max_samples,
     )
     sweep_begin = round(rate_hz * rest_s)
     sweep_end = sweep_begin + round(rate_hz * duration_s)
@@ -233,15 +243,20 @@ def lay_out_segments(
 
 
 def check_ticks(
-    message_start: str, tick_count: float, rate_hz: float, rest_and_ring_down_s: float = 0.0
+    message_start: str,
+    tick_count: float,
+    rate_hz: float,
+    rest_and_ring_down_s: float = 0.0,
+    *,
+    max_samples: int = MAX_SAMPLES,
 ) -> None:
     """Raise `ExcitationError` if a record has more ticks than can be analysed.
 
     `message_start` is the subject of the message, and `rest_and_ring_down_s` the total duration of
     rest and ring-down.
     """
-    if tick_count > MAX_SAMPLES:
-        max_duration_s = MAX_SAMPLES / rate_hz
+    if tick_count > max_samples:
+        max_duration_s = max_samples / rate_hz
         limit_text = (
             f" ({max_duration_s - rest_and_ring_down_s:g} s between rest and ring-down)"
             if 0.0 < rest_and_ring_down_s < max_duration_s
@@ -249,8 +264,8 @@ def check_ticks(
         )
         raise ExcitationError(
             f"{message_start} would take {tick_count / rate_hz:g} s; {max_duration_s:g} s is the "
-            f"most at {rate_hz:g} Hz{limit_text}, because no more than {MAX_SAMPLES} samples can "
-            "be analysed, exported or replayed: shorten it or run several sessions."
+            f"most at {rate_hz:g} Hz{limit_text}, because no more than {max_samples} samples of it "
+            "can be analysed: shorten it or run several sessions."
         )
 
 
@@ -498,7 +513,10 @@ def multisine(
     require_positive("period_s", period_s, "s")
     if seed < 0:
         raise ExcitationError(f"seed = {seed} is negative; give a whole number from 0 on.")
-    segment_ticks = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    # Its periods are equal, so a long record is analysed in blocks.
+    segment_ticks = lay_out_segments(
+        rate_hz, rest_s, duration_s, ring_down_s, max_samples=MAX_RECORDED_SAMPLES
+    )
     period_ticks = to_whole_ticks("period_s", period_s, rate_hz)
     period_count = round(duration_s / period_s)
     if period_count < 1 or abs(period_count * period_s - duration_s) > 1e-9 * duration_s:
@@ -510,8 +528,14 @@ def multisine(
         period_ticks, period_s, (start_hz, stop_hz), seed
     )
     crest_factor = amplitude_rad / float(np.sqrt(np.mean(period_rad**2)))
-    t = _sweep_times_s(segment_ticks, rate_hz)
-    sweep_rad = np.tile(period_rad, period_count) * _taper_factors(t, duration_s, taper_s)
+    sweep_rad = _sweep_in_blocks(
+        segment_ticks,
+        rate_hz,
+        lambda t: (
+            period_rad[np.rint(t * rate_hz).astype(np.intp) % period_ticks]
+            * _taper_factors(t, duration_s, taper_s)
+        ),
+    )
     parameters = {
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
@@ -549,12 +573,6 @@ def _random_phase_period(
     unit_period = np.roll(unit_period, -int(np.argmin(np.abs(unit_period))))
     unit_period /= np.max(np.abs(unit_period))
     return unit_period
-
-
-def _sweep_times_s(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> FloatArray:
-    """Return the time in s of each tick of the sweep, from its first tick on."""
-    sweep_begin, sweep_end = segments["sweep"]
-    return np.arange(sweep_end - sweep_begin) / rate_hz
 
 
 def _sweep_in_blocks(

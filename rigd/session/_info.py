@@ -178,7 +178,7 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     """
     path = Path(path)
     session = read_session(
-        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_RECORDED_SAMPLES
     )
     rate_hz = session.number("rate_hz")
     if rate_hz <= 0:

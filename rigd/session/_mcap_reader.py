@@ -278,6 +278,9 @@ class _ContainerReader:
             record_offset = record_end
             opcode, content_start, record_end = _locate_record(data, record_offset, "")
             self._budget.count_steps(1)
+            if opcode == Opcode.MESSAGE_INDEX:  # several follow each chunk
+                contents.intact_bytes = record_end
+                continue
             if opcode == Opcode.CHUNK:
                 self._read_chunk(data[content_start:record_end], record_offset)
                 if on_progress is not None:
@@ -665,11 +668,13 @@ class _ContainerReader:
             self._crc_of_range(section_start, footer_position + FOOTER_FORMAT.size - 4),
         ):
             raise McapDamageError("has a wrong checksum over its summary")
+        if self._has_omitted_chunks:  # then neither channels nor statistics can be compared
+            return
         for opcode, record_content in self._summary_records(section_start, footer_position):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 # A channel without messages may be declared in the summary only.
                 self._read_declaration(opcode, record_content, " in the summary")
-            elif opcode == Opcode.STATISTICS and not self._has_omitted_chunks:
+            elif opcode == Opcode.STATISTICS:
                 statistics = parse_record(Statistics.read, record_content, " in the summary")
                 read_message_counts = self.contents.message_counts
                 stated_message_counts = statistics.channel_message_counts

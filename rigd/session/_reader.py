@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -190,7 +190,7 @@ def read_session(
         path,
         (SAMPLE_TOPIC, EVENT_TOPIC),
         add_block,
-        None if part_s is None else _chunks_of_part(part_s),
+        None if part_s is None else _ChunksOfPart(part_s),
     )
     metadata = merged_metadata(mcap_contents, "session") or {}
     format_version = metadata.get("format_version", FORMAT_VERSION)
@@ -421,32 +421,45 @@ class _UndecodedLog:
         return logged_events
 
 
-def _chunks_of_part(part_s: tuple[float, float]) -> IsChunkNeeded:
-    """Return the function that selects the chunks of a part of a session and of its rest.
+class _ChunksOfPart:
+    """Selection of the chunks of a part of a session and of its segment ``rest``.
 
-    The function selects every chunk of a file that does not state its rate and its start before the
-    samples.
+    Every chunk is selected of a file that does not state its rate and its start before the samples.
     """
 
-    def is_chunk_needed(contents: McapContents, first_log_time: int, last_log_time: int) -> bool:
+    def __init__(self, part_s: tuple[float, float]) -> None:
+        self._part_s = part_s
+        self._log_time_ranges: list[tuple[float, float]] | None = None  # of rest and part
+
+    def __call__(self, contents: McapContents, first_log_time: int, last_log_time: int) -> bool:
+        """Return whether a chunk with messages between two log times is needed."""
+        if self._log_time_ranges is None:
+            if not contents.channels:  # they may be declared in the first chunk alone
+                return True
+            self._log_time_ranges = self._ranges_of_log_time(contents)
+        return any(
+            first_log_time <= last and last_log_time >= first
+            for first, last in self._log_time_ranges
+        )
+
+    def _ranges_of_log_time(self, contents: McapContents) -> list[tuple[float, float]]:
+        """Return first and last log time in ns of rest and part, with a margin around each."""
         metadata = merged_metadata(contents, "session") or {}
         segments = merged_metadata(contents, "segments") or {}
         try:
             start_utc_ns = int(metadata["start_utc_ns"])
             rest_end_s = int(segments.get("rest", "0,0").split(",")[1]) / float(metadata["rate_hz"])
         except (KeyError, ValueError, ArithmeticError, IndexError):
-            return True
-        if not contents.channels:  # they may be declared in the first chunk alone
-            return True
-        first_s, last_s = (
-            (log_time - start_utc_ns) / 1e9 for log_time in (first_log_time, last_log_time)
-        )
-        margin_s = _PART_MARGIN_S + _MAX_CLOCK_DEVIATION * abs(last_s)
-        return first_s <= rest_end_s + margin_s or (
-            first_s <= part_s[1] + margin_s and last_s >= part_s[0] - margin_s
-        )
+            return [(-inf, inf)]
 
-    return is_chunk_needed
+        def log_time(time_s: float, side: int) -> float:
+            margin_s = _PART_MARGIN_S + _MAX_CLOCK_DEVIATION * abs(time_s)
+            return start_utc_ns + 1e9 * (time_s + side * margin_s)
+
+        return [
+            (log_time(from_s, -1), log_time(to_s, 1))
+            for from_s, to_s in ((0.0, rest_end_s), self._part_s)
+        ]
 
 
 def _load_intact_contents(

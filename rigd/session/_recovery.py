@@ -193,7 +193,7 @@ def recover(
         try:
             read_session(
                 temporary_path,
-                max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
+                max_samples=limits.MAX_RECORDED_SAMPLES,
                 on_samples=read_back_digest.add_samples,
             )
         except SessionError as error:
@@ -238,7 +238,7 @@ class _SampleSelection:
         self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
         """Time, tick and status of the samples that are copied."""
         self._samples = TopicBuffer(
-            path, SAMPLES, ORDER_AND_FLAG_FIELDS, limits.MAX_SAMPLES_WITHOUT_SIGNALS
+            path, SAMPLES, ORDER_AND_FLAG_FIELDS, limits.MAX_RECORDED_SAMPLES
         )
         self._samples_per_chunk: dict[
             int, int
@@ -313,7 +313,7 @@ def _scaled_progress(
 def _copy_intact_file(path: Path, final_path: Path) -> Recovery:
     """Copy a complete ``.part`` file to its final name; do nothing with any other intact file."""
     session = read_session(
-        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_RECORDED_SAMPLES
     )
     is_part_file = path.name.endswith(PART_SUFFIX)
     if is_part_file:

@@ -6,19 +6,19 @@ A reader's memory and time grow with the sizes and counts that a file states, so
 from typing import Final
 
 MAX_SAMPLES: Final = 4_000_000
-"""Maximum number of samples of a record that is planned, recorded, imported, analysed, exported or
-replayed: an hour at 1 kHz, with rest and ring-down. The samples take 0.45 GB of memory. An
-analysis, which decimates a long record while it is read, takes 0.65 GB with the default band."""
-MAX_SAMPLES_WITHOUT_SIGNALS: Final = 7_200_000
-"""Maximum number of samples of a file of which only times, ticks and flags are read, or some of the
-signals: two hours at 1 kHz, the longest recording of an earlier version."""
+"""Maximum number of samples that are imported, exported or replayed, or analysed in one fit: an
+hour at 1 kHz, with rest and ring-down. The samples take 0.45 GB of memory. An analysis, which
+decimates a long record while it is read, takes 0.65 GB with the default band."""
+MAX_RECORDED_SAMPLES: Final = 40_000_000
+"""Maximum number of samples of a file, of which all are recorded, described and recovered, and
+blocks or parts are analysed: eleven hours at 1 kHz."""
 
-MAX_FILE_BYTES: Final = 2 << 30
+MAX_FILE_BYTES: Final = 8 << 30
 """Maximum length of a session file in bytes."""
 MAX_CHUNK_BYTES: Final = 256 << 20
 """Maximum length of a decompressed chunk in bytes."""
-MAX_TOTAL_UNPACKED_BYTES: Final = 2 << 30
-"""Maximum length of all decompressed chunks of a file in bytes: 2.5 hours at 1 kHz."""
+MAX_TOTAL_UNPACKED_BYTES: Final = 8 << 30
+"""Maximum length of all decompressed chunks of a file in bytes: 14 hours at 1 kHz."""
 MAX_DECLARATION_BYTES: Final = 64 << 20
 """Maximum memory in bytes for schemas, channels, metadata and attachments of a file together."""
 MAX_DECLARATION_TEXT_BYTES: Final = 32 << 20

@@ -73,7 +73,7 @@ def test_the_limits_are_those_of_the_code():
     assert f"of more than {limits.MAX_SAMPLE_MESSAGE_BYTES >> 10} KiB" in DOCUMENT
     assert f"more than {limits.MAX_READING_STEPS // 10**6} million runs" in DOCUMENT
     assert f"more than {limits.MAX_SINGLY_DECODED_MESSAGES // 1000} 000 samples" in DOCUMENT
-    assert f"up to {limits.MAX_SAMPLES_WITHOUT_SIGNALS / 1e6:g} million samples" in DOCUMENT
+    assert f"up to {limits.MAX_RECORDED_SAMPLES / 1e6:g} million samples" in DOCUMENT
     assert f"up to {limits.MAX_SAMPLES / 1e6:g} million samples" in DOCUMENT
 
 
