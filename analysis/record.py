@@ -6,10 +6,7 @@ incomplete sweep. This module interpolates such samples within limits, counts an
 
 from __future__ import annotations
 
-import math
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,7 +34,7 @@ from analysis.record_ticks import (
     TickGrid,
     TorqueExtreme,
 )
-from rigd.session import Session, SessionError, limits, read_session, readable_texts
+from rigd.session import Session, limits, read_session, readable_texts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -286,8 +283,12 @@ def load_record(
     if not may_be_longer(path, longest_samples):
         session = read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES)
         return record_of(session, part_s, highest_hz=highest_hz, longest_samples=longest_samples)
+    from analysis.record_part import read_session_part  # late: for a long record only
+
     # The signals are read after the ticks of all samples: they may take too much memory.
-    session, interval_s = _read_ticks(path, part_s)
+    session, interval_s = read_session_part(
+        path, part_s, fields=_TICK_FIELDS, max_samples=limits.MAX_RECORDED_SAMPLES
+    )
     grid, covered_interval_s = _tick_grid_of(session, part_s)
     # The grid replaces the ticks, of which a long record has many.
     session = replace(session, samples=session.samples[:0].copy())
@@ -311,27 +312,6 @@ def load_record(
         covered_interval_s,
         _median_angle_rad(rest_angles_rad),
     )
-
-
-def _read_ticks(
-    path: Path, part_s: PartOption | None
-) -> tuple[Session, tuple[float, float] | None]:
-    """Read the ticks of a session, or of the chunks that contain a part of it.
-
-    The second result is the interval in s whose chunks were read; None for all of them.
-    """
-    read_ticks = partial(
-        read_session, path, fields=_TICK_FIELDS, max_samples=limits.MAX_RECORDED_SAMPLES
-    )
-    if part_s is not None:
-        interval_s = (part_s[0] or 0.0, math.inf if part_s[1] is None else part_s[1])
-        with suppress(SessionError):  # raised again if the whole file has the error
-            session = read_ticks(part_s=interval_s)
-            if len(session.samples):
-                end_s = (int(session.samples["tick"][-1]) + 1) / stated_rate_hz(session)
-                if interval_s[0] < end_s and (part_s[1] is None or part_s[1] <= end_s):
-                    return session, interval_s
-    return read_ticks(), None
 
 
 def may_be_longer(path: Path, sample_count: int) -> bool:

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.record_checks import RecordError, first_mode_hz
-from rigd.session import SessionError, linear_sweep_band_hz, read_summary, sweep_frequency_hz
+from analysis.record_checks import RecordError, first_mode_hz, stated_rate_hz
+from rigd.session import (
+    SessionError,
+    linear_sweep_band_hz,
+    read_session,
+    read_summary,
+    sweep_frequency_hz,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from rigd.beam import Beam
@@ -118,8 +127,48 @@ def blocks_of_session(path: Path, block_s: float = BLOCK_S) -> tuple[RecordSourc
     )
 
 
+def read_session_part(
+    path: Path, part_s: PartOption | None, *, fields: Sequence[str], max_samples: int
+) -> tuple[Session, tuple[float, float] | None]:
+    """Read a session, or only those of its chunks that contain samples of a part.
+
+    Parameters
+    ----------
+    path : Path
+        Session file.
+    part_s : tuple of float or None
+        Beginning and end of the part in seconds since the session's start, None for the beginning
+        or end of the session. None for the whole session.
+    fields : sequence of str
+        Fields of the samples, as for `rigd.session.read_session`.
+    max_samples : int
+        Maximum number of samples.
+
+    Returns
+    -------
+    session : Session
+        Session with at least the samples of the part, and those of its rest.
+    interval_s : tuple of float or None
+        Beginning and end in seconds of the interval that was read; None for all samples.
+    """
+    read = partial(read_session, path, fields=fields, max_samples=max_samples)
+    if part_s is not None:
+        interval_s = (part_s[0] or 0.0, math.inf if part_s[1] is None else part_s[1])
+        with suppress(SessionError):  # raised again if the whole file has the error
+            session = read(part_s=interval_s)
+            if len(session.samples):
+                end_s = (int(session.samples["tick"][-1]) + 1) / stated_rate_hz(session)
+                if interval_s[0] < end_s and (part_s[1] is None or part_s[1] <= end_s):
+                    return session, interval_s
+    return read(), None
+
+
 def part_of_session(
-    session: Session, requested_part_s: PartOption, rate_hz: float
+    session: Session,
+    requested_part_s: PartOption,
+    rate_hz: float,
+    *,
+    needs_sweep: bool = True,
 ) -> tuple[Session, tuple[float, float]]:
     """Return the part of a session between two times, and these times.
 
@@ -134,6 +183,8 @@ def part_of_session(
         or end of the session.
     rate_hz : float
         Sampling rate.
+    needs_sweep : bool
+        Whether a part that contains nothing of the sweep is an error.
 
     Returns
     -------
@@ -172,7 +223,7 @@ def part_of_session(
         for segment_name, (segment_first, segment_end) in session.segments.items()
         if max(segment_first, first_tick) < min(segment_end, end_tick)
     }
-    if "sweep" in session.segments and "sweep" not in part_segments:
+    if needs_sweep and "sweep" in session.segments and "sweep" not in part_segments:
         sweep_limits_s = [tick / rate_hz for tick in session.segments["sweep"]]
         raise RecordError(
             f"{path}: the part from {from_s:g} to {to_s:g} s contains nothing of the sweep, which "

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._trend import Trend, linear_trend
 from analysis.campaigns.pooling import common_structure, freest_estimate, random_effects
+from analysis.campaigns.trend import Trend, linear_trend
 from analysis.statistics import chi_square_p_value
 from rigd.beam import LOGARITHMIC_PARAMETERS
 

@@ -231,7 +231,19 @@ def import_command(
 
 
 @export_app.command("record", epilog=_EXPORT_EPILOG)
-def export_record_command(session: _Session, target: _Target, binary: _Binary = False) -> None:
+def export_record_command(
+    session: _Session,
+    target: _Target,
+    binary: _Binary = False,
+    from_s: Annotated[
+        float | None,
+        typer.Option("--from", metavar="S", help="First time of the part to be written (s)."),
+    ] = None,
+    to_s: Annotated[
+        float | None,
+        typer.Option("--to", metavar="S", help="End of the part to be written (s)."),
+    ] = None,
+) -> None:
     """Write the samples as recorded.
 
     Writes time, angles, torques, wrench and status bits.
@@ -239,7 +251,8 @@ def export_record_command(session: _Session, target: _Target, binary: _Binary = 
     from analysis.exchange import export_record
 
     def export_samples() -> None:
-        export_table = export_record(session, target, binary=binary)
+        part_s = None if from_s is None and to_s is None else (from_s, to_s)
+        export_table = export_record(session, target, binary=binary, part_s=part_s)
         typer.echo(f"{len(export_table.axis.values)} samples of {session}: {target}")
 
     raise typer.Exit(_run_for_exit_code(export_samples))

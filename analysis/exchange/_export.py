@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from analysis.exchange._table import ExportTable
     from analysis.linear_model import LinearModel, ModelOptions
     from analysis.models import WelchSettings
+    from analysis.record_part import PartOption
 
 _UNIVERSAL_SUFFIXES: Final = (".uff", ".unv", ".uf58")
 """Suffixes of universal files."""
@@ -27,7 +28,9 @@ SUFFIXES: Final = (".csv", ".mat", *_UNIVERSAL_SUFFIXES)
 """Suffixes of the files to which records and frequency responses can be written."""
 
 
-def export_record(session: Path, target: Path, *, binary: bool = False) -> ExportTable:
+def export_record(
+    session: Path, target: Path, *, binary: bool = False, part_s: PartOption | None = None
+) -> ExportTable:
     """Write the samples of a session, as recorded, to a file for another program.
 
     Parameters
@@ -38,6 +41,9 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Expor
         New file, whose suffix (one of `SUFFIXES`) selects the format.
     binary : bool
         Whether a universal file has 8-byte floats instead of text.
+    part_s : tuple of float or None, optional
+        Beginning and end of the part to be written, in seconds since the session's start; None for
+        the session's beginning or end. By default, all samples are written.
 
     Returns
     -------
@@ -54,6 +60,8 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Expor
         If the file exists or cannot be written.
     rigd.session.SessionError
         If the session cannot be read.
+    analysis.record.RecordError
+        If the part is not in the record.
 
     Examples
     --------
@@ -64,7 +72,7 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Expor
     ['tick', 'angle_reference_rad', 'angle_rad']
     """
     check_target(target, binary=binary)
-    table = record_table(session)
+    table = record_table(session, part_s)
     _write_table(table, target, binary=binary)
     return table
 

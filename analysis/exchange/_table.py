@@ -12,8 +12,9 @@ from analysis.applicability import highest_frequency_hz, welch_settings
 from analysis.exchange._source import ExchangeError
 from analysis.paper import estimate
 from analysis.record import load_record
-from rigd.session import read_session
+from analysis.record_part import part_of_session, read_session_part
 from rigd.session.layout import SAMPLE_FIELDS
+from rigd.session.limits import MAX_SAMPLES
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.models import WelchSettings
+    from analysis.record_part import PartOption
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,19 +84,24 @@ _COLUMN_TITLES: Final = {
 """Title of each exported field of a sample."""
 
 
-def record_table(path: Path) -> ExportTable:
+def record_table(path: Path, part_s: PartOption | None = None) -> ExportTable:
     """Return the samples of a session as recorded, with gaps, and the status bits as a column.
 
-    Raise `SessionError` if the file cannot be read. Raise `ExchangeError` if the session has no
-    samples or no sampling rate.
+    `part_s` is a part of the session, as for `analysis.record.load_record`. Raise `SessionError` if
+    the file cannot be read. Raise `ExchangeError` if the session has no samples or no sampling
+    rate. Raise `RecordError` if the part is not in the record.
     """
-    session = read_session(path, fields=("t_ns", *_COLUMN_TITLES))
+    session, _ = read_session_part(
+        path, part_s, fields=("t_ns", *_COLUMN_TITLES), max_samples=MAX_SAMPLES
+    )
     rate_hz = session.number("rate_hz")
     if len(session.samples) == 0 or not rate_hz > 0.0:
         raise ExchangeError(
             f"{path}: the session has {len(session.samples)} samples at {rate_hz:g} Hz; there is "
             "nothing to export."
         )
+    if part_s is not None:
+        session, _ = part_of_session(session, part_s, rate_hz, needs_sweep=False)
     session_samples = session.samples
     return ExportTable(
         path.name,

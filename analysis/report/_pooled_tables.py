@@ -542,7 +542,7 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
         (
             "Between sessions: standard deviation beyond the sessions' own uncertainties (τ). τ/s: "
             "the same over a typical session's own. I²: its share of the variance. p: p-value of "
-            "Cochran's Q.",
+            "Cochran's Q. Modes are those of the modal model, if sessions have one.",
             *(
                 ["Change per hour: slope of a straight line. Its p: p-value of no change."]
                 if has_trends

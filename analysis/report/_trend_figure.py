@@ -44,7 +44,8 @@ def trend_figure(campaign: CampaignResult) -> Figure:
         width_in,
         height_in,
         f"Change with time over {max(times_h.values()):.3g} h, {len(times_h)} {kind_text}",
-        f"each fitted by itself, type {campaign.homogeneity.structure}  ·  p: p-value of no change",
+        f"each fitted by itself  ·  parameters: type {campaign.homogeneity.structure}  ·  "
+        "p: p-value of no change",
     )
     grid = figure.add_gridspec(
         row_count, _PANELS_PER_ROW, left=0.07, right=0.99, top=1 - 1.2 / height_in,
@@ -60,9 +61,10 @@ def trend_figure(campaign: CampaignResult) -> Figure:
     legend_handles = [
         Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
                label=f"{kind_text.removesuffix('s')}, ± 1.96 of its standard deviation"),
-        Line2D([], [], color=style.VERMILION, label="significant change"),
     ]  # fmt: skip
-    style.add_legend(figure, legend_handles, column_count=2)
+    if any(scatter.has_significant_trend for scatter in scatters):
+        legend_handles.append(Line2D([], [], color=style.VERMILION, label="significant change"))
+    style.add_legend(figure, legend_handles, column_count=len(legend_handles))
     return figure
 
 

@@ -308,7 +308,8 @@ class TopicBuffer:
         if messages_end > self._max_messages:
             raise SessionError(
                 f"{self._path} holds more than the {self._max_messages} messages of {self._topic} "
-                "that fit into the memory that reading a session may take. Give a shorter session."
+                "that fit into the memory that reading a session may take. Give a shorter session, "
+                "or a part of it (--from and --to of analyze, and of analyze export record)."
             )
         if self._on_messages is not None:
             return np.empty(message_count, self.decoder.dtype)

@@ -8,7 +8,8 @@ import pytest
 from analysis import api
 from analysis.decimation import Decimation
 from analysis.identify import BAND_HZ, Measurement, fit_freest_alone
-from analysis.record import RecordError, load_record
+from analysis.record import RecordError, load_record, record_of
+from rigd.session import read_session
 from rigd.session.layout import Status
 from rigd.testing import chirp_signals
 
@@ -41,6 +42,32 @@ def test_result_does_not_depend_on_blocks(paper_file, decimated):
     assert (full_rate.rate_hz, full_rate.samples, full_rate.sweep) == (
         whole.rate_hz, whole.time_s.size, whole.sweep,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("part_s", [(40.0, 100.0), (None, 60.0), (60.0, None)])
+def test_part_of_a_long_file_is_that_of_the_whole(paper_file, part_s):
+    """Only its chunks, and those of the rest, are read from a long file."""
+    expected = record_of(read_session(paper_file), part_s, longest_samples=20_000)
+    found = load_record(paper_file, part_s, longest_samples=20_000)
+    for name in ("time_s", "reference_rad", "angle_rad", "torque_nm", "torque_known"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), rtol=0, atol=1e-15
+        )
+    for name in ("rate_hz", "sweep", "rest_angle_rad", "gaps", "part_s", "swept_hz", "warnings"):
+        assert getattr(found, name) == getattr(expected, name)
+
+
+@pytest.mark.parametrize(
+    ("part_s", "words"),
+    [
+        ((60.0, 140.0), "beyond the record, which covers 0 to 136 s"),
+        ((137.0, None), "beyond the record, which covers 0 to 136 s"),
+        ((135.0, 136.0), "from 135 to 136 s contains nothing of the sweep"),
+    ],
+)
+def test_unusable_part_of_a_long_file_is_refused(paper_file, part_s, words):
+    with pytest.raises(RecordError, match=words):
+        load_record(paper_file, part_s, longest_samples=20_000)
 
 
 def test_short_record_is_not_decimated(paper_file):

@@ -190,7 +190,7 @@ def test_distance_of_groups_is_that_of_their_frequencies(mixture, truth):
     assert stiff - soft == pytest.approx(distance_hz, abs=3 * own_hz)
     # Of two equal groups at a distance d the variance of four is d²/3, nearly all between sessions.
     assert frequency.between_session_std == pytest.approx((stiff - soft) / math.sqrt(3), rel=0.01)
-    assert frequency.relative_between_session_std > 10
+    assert frequency.relative_between_session_std > 8
 
 
 @pytest.mark.further  # as made by hand above

@@ -21,7 +21,7 @@ from analysis.exchange import (
 from analysis.models import WelchSettings
 from analysis.paper import estimate
 from analysis.paper.welch_analysis import analyse
-from analysis.record import load_record
+from analysis.record import RecordError, load_record
 from rigd.session import read_session
 
 pytestmark = pytest.mark.process
@@ -186,3 +186,16 @@ def test_user_metadata_stay_texts_in_mat(make_session, tmp_path):
     information = scipy.io.loadmat(tmp_path / "r.mat", squeeze_me=True)["information"]
     metadata = {key: information[key].item() for key in added}
     assert metadata == {"note": "12", "specimen": "7", "meta_batch": "007", "meta_length_m": 0.98}
+
+
+def test_part_of_a_record(paper_file, tmp_path):
+    """Also one that contains nothing of the sweep."""
+    whole = read_session(paper_file).samples
+    for part_s, ticks in (((None, 0.5), slice(0, 500)), ((130.0, None), slice(130_000, None))):
+        table = export_record(paper_file, tmp_path / f"{ticks.start}.csv", part_s=part_s)
+        columns = {column.name: column.values for column in table.columns}
+        np.testing.assert_array_equal(columns["tick"], whole["tick"][ticks])
+        np.testing.assert_array_equal(columns["angle_rad"], whole["angle_rad"][ticks])
+    with pytest.raises(RecordError, match="beyond the record"):
+        export_record(paper_file, tmp_path / "c.csv", part_s=(100.0, 200.0))
+    assert not (tmp_path / "c.csv").exists()

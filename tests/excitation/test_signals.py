@@ -281,3 +281,14 @@ def test_absurd_options_are_refused(make, options, complaint):
     with pytest.raises(ExcitationError) as caught:
         make(rate_hz=1000.0, **options)
     assert complaint in str(caught.value)
+
+
+def test_multisine_lasts_longer_than_one_fit_takes(rate_hz=100.0):
+    """Its blocks are analysed one by one. Its periods are equal, also where blocks are computed."""
+    long = multisine(rate_hz=rate_hz, stop_hz=20, period_s=20, duration_s=50_000, rest_s=0)
+    periods_rad = long.reference_rad[: 100 * 50_000].reshape(-1, 2000)
+    assert np.ptp(periods_rad, axis=0).max() == 0
+    with pytest.raises(ExcitationError, match="no more than 4000000 samples"):
+        chirp(rate_hz=rate_hz, stop_hz=20, duration_s=50_000)
+    with pytest.raises(ExcitationError, match="no more than 40000000 samples"):
+        multisine(rate_hz=rate_hz, stop_hz=20, period_s=20, duration_s=500_000)

@@ -11,6 +11,7 @@ from google.protobuf import message_factory
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from session_schemas import message_class, schemas
 
@@ -72,6 +73,34 @@ def test_samples_passed_on_are_not_stored(recorded):
     assert session == dataclasses.replace(read_session(recorded.path), samples=session.samples)
     assert len(session.samples) == 0
     np.testing.assert_array_equal(np.concatenate(blocks), recorded.samples)
+
+
+def test_part_has_its_chunks_and_those_of_the_rest(paper_file):
+    whole = read_session(paper_file)
+    part = read_session(paper_file, part_s=(60.0, 70.0))
+    assert dataclasses.replace(part, samples=whole.samples) == whole
+    ticks = part.samples["tick"]
+    assert {*range(1000), *range(60_000, 70_000)} <= set(ticks.tolist())
+    assert len(ticks) < 22_000
+    np.testing.assert_array_equal(part.samples, whole.samples[ticks])
+
+
+def test_chunks_outside_a_part_are_not_checked(paper_file, tmp_path):
+    with paper_file.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    content = bytearray(paper_file.read_bytes())
+    content[chunks[len(chunks) // 2].chunk_start_offset + 200] ^= 1  # at 68 s
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    for part_s in (None, (60.0, 70.0)):
+        with pytest.raises(SessionError, match="is damaged"):
+            read_session(damaged, part_s=part_s)
+    assert len(read_session(damaged, part_s=(100.0, 110.0)).samples) > 10_000
+
+
+def test_file_without_a_usable_rate_is_read_as_a_whole(write_session, short_signals, tmp_path):
+    path = write_session(tmp_path / "a.mcap", short_signals, metadata={"rate_hz": "often"})
+    assert len(read_session(path, part_s=(4.9, 5.0)).samples) == 5000
 
 
 def test_many_small_chunks_use_one_decompressor(kit, tmp_path, monkeypatch):

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 MIN_TREND_SESSIONS: Final = 4
 """Smallest number of sessions for a trend: two more than the unknowns of a straight line."""
 
+_MIN_COVERED_H: Final = 1e-3
+"""Shortest time in hours over which a change is estimated."""
+
 
 @dataclass(frozen=True, slots=True)
 class Trend:
@@ -65,7 +68,7 @@ def linear_trend(
 
     Examples
     --------
-    >>> from analysis.campaigns._trend import linear_trend
+    >>> from analysis.campaigns.trend import linear_trend
     >>> trend = linear_trend([0, 3600, 7200, 10800], [1.0, 1.11, 1.19, 1.3], [0.01] * 4)
     >>> print(f"{trend.slope_per_h:.3f} per h in {trend.covered_h:g} h")
     0.098 per h in 3 h
@@ -74,11 +77,12 @@ def linear_trend(
     if len(known_times_s) < max(len(times_s), MIN_TREND_SESSIONS):
         return None
     times_h = np.array(known_times_s) / 3600
+    covered_h = float(np.ptp(times_h))
+    if covered_h < _MIN_COVERED_H:
+        return None
     weights = 1 / np.array(stds) ** 2
     centred_h = times_h - weights @ times_h / weights.sum()
     time_variance = float(weights @ centred_h**2)
-    if not time_variance > 0.0:
-        return None
     values = np.array(estimates)
     mean = weights @ values / weights.sum()
     slope = float(weights * centred_h @ values) / time_variance
@@ -92,5 +96,5 @@ def linear_trend(
         slope_std,
         (slope - half_width, slope + half_width),
         student_t_p_value(slope / slope_std, degrees_of_freedom),
-        float(np.ptp(times_h)),
+        covered_h,
     )
