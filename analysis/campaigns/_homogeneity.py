@@ -137,6 +137,11 @@ class Homogeneity:
     is_one_session: bool = False
 
     @property
+    def significance_level(self) -> float:
+        """Significance level of a single quantity."""
+        return _level_of_each(len(self.quantities))
+
+    @property
     def leading_scatter(self) -> Heterogeneity | None:
         """Quantity that shows most clearly that the sessions differ; None if they do not differ.
 
@@ -203,7 +208,7 @@ def homogeneity(
         for quantity, quantity_values in values_by_quantity.items()
         if len(quantity_values) >= _MIN_COMPARED_SESSIONS
     }
-    significance_level = SIGNIFICANCE_LEVEL / max(len(values_by_quantity), 1)
+    significance_level = _level_of_each(len(values_by_quantity))
     times_s = {session.name: session.experiment.middle_utc_s for session in sessions}
     return Homogeneity(
         tuple(specimens),
@@ -219,6 +224,11 @@ def homogeneity(
         is_one_session=all(session.source.part_s is not None for session in sessions)
         and len({session.path for session in sessions}) == 1,
     )
+
+
+def _level_of_each(quantity_count: int) -> float:
+    """Return the significance level of each of several quantities (Bonferroni)."""
+    return SIGNIFICANCE_LEVEL / max(quantity_count, 1)
 
 
 def _modal_values(sessions: Sequence[SessionAnalysis]) -> Iterator[tuple[str, SessionEstimates]]:

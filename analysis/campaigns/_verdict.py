@@ -284,7 +284,7 @@ def campaign_verdict(
                 ],
                 lowest_bic_estimate,
             ),
-            *([] if homogeneity.is_mixture else [sentences.describe_scatter(freest_fit)]),
+            *([] if homogeneity.is_mixture else sentences.describe_scatter(homogeneity)),
             *sentences.describe_prediction_errors(freest_fit, validation, len(sessions)),
             *sentences.describe_failed_predictions(failed_predictions, len(sessions)),
         ),

@@ -19,6 +19,7 @@ from rigd.units import decimals, rounded_to_uncertainty
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
+    from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._validation import FailedPrediction, LeaveOneOutResult
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
@@ -33,8 +34,6 @@ _ORDER_NAMES: Final[tuple[OrderName, ...]] = ("alpha", "lambda")
 """Names of the orders of internal and of external damping."""
 _CLASSICAL_STRUCTURE: Final = "III"
 """Structure with internal and external damping, both of order 1."""
-_SIGNIFICANCE_LEVEL: Final = 0.01
-"""Significance level, for all parameters together, of a test for between-session variance."""
 _MAX_EQUAL_ERROR_RATIO: Final = 1.01
 """Largest ratio of prediction error to in-sample error that counts as equally good."""
 
@@ -433,36 +432,35 @@ def describe_dissent(
     ]
 
 
-def describe_scatter(pooled_estimate: PooledEstimate) -> str:
-    """Describe whether any parameter varies significantly between the sessions.
+def describe_scatter(homogeneity: Homogeneity) -> list[str]:
+    """Describe whether any quantity varies significantly between the sessions.
 
-    The level of the test gives one false alarm in a hundred campaigns.
+    The level of the test gives one false alarm in a hundred campaigns. The list is empty if nothing
+    could be compared.
     """
-    significance_level = _SIGNIFICANCE_LEVEL / max(len(pooled_estimate.parameters), 1)
+    if not homogeneity.quantities:
+        return []
     varying_labels = [
-        label_and_unit(parameter.name)[0]
-        for parameter in pooled_estimate.parameters
-        if parameter.heterogeneity_p_value < significance_level
+        label_and_unit(scatter.quantity)[0]
+        for scatter in homogeneity.quantities
+        if scatter.p_value < homogeneity.significance_level
     ]
     if not varying_labels:
-        lowest_p_value = min(
-            (parameter.heterogeneity_p_value for parameter in pooled_estimate.parameters),
-            default=1.0,
-        )
+        lowest_p_value = min(scatter.p_value for scatter in homogeneity.quantities)
         tau_remark = (
             "; the τ above zero are within chance"
-            if any(parameter.between_session_std > 0 for parameter in pooled_estimate.parameters)
+            if any(scatter.between_session_std > 0 for scatter in homogeneity.quantities)
             else ""
         )
-        return (
+        return [
             "No significant between-session variance (Cochran's Q, lowest p of "
-            f"{len(pooled_estimate.parameters)}: {format_p_value(lowest_p_value)}{tau_remark})."
-        )
-    return (
+            f"{len(homogeneity.quantities)}: {format_p_value(lowest_p_value)}{tau_remark})."
+        ]
+    return [
         f"Between-session variance in {', '.join(varying_labels)} (Cochran's Q): something changes "
         "between sessions, such as clamp, temperature or motor, and the interval of a single "
         "session is too narrow for the specimen."
-    )
+    ]
 
 
 def describe_prediction_errors(

@@ -227,20 +227,21 @@ def test_dissenting_session_is_reported(make_session, estimates_of, campaign_of)
     assert campaign_of([make_session(f"{n}.mcap") for n in range(2)]).verdict is None
 
 
+def scattered(p_value, between_session_std=0.0):
+    return Homogeneity(
+        (), (Heterogeneity("zeta", (), 1e-4, between_session_std, 1.0, p_value, False, ()),)
+    )
+
+
 def test_sentences_on_scatter_and_misfit(estimates_of):
     (best,) = ranked(estimates_of("VI", 100.0))
-    assert "No significant between-session variance" in sentences.describe_scatter(best)
-    assert "τ" not in sentences.describe_scatter(best)
-    some = replace(
-        best,
-        parameters=(
-            replace(best.parameters[0], between_session_std=0.1, heterogeneity_p_value=0.2),
-        ),
-    )
-    assert "lowest p of 1: 0.2; the τ above zero are within chance" in sentences.describe_scatter(
-        some
-    )
-    shaken = replace(best, parameters=(replace(best.parameters[0], heterogeneity_p_value=1e-4),))
-    assert "Between-session variance in ζ" in sentences.describe_scatter(shaken)
+    (agreeing,) = sentences.describe_scatter(scattered(0.5))
+    assert "No significant between-session variance" in agreeing
+    assert "τ" not in agreeing
+    (by_chance,) = sentences.describe_scatter(scattered(0.2, between_session_std=0.1))
+    assert "lowest p of 1: 0.2; the τ above zero are within chance" in by_chance
+    (shaken,) = sentences.describe_scatter(scattered(1e-4))
+    assert "Between-session variance in ζ" in shaken
+    assert sentences.describe_scatter(Homogeneity((), ())) == []
     assert "no structure fitted" in sentences.describe_residual(replace(best, misfit=9.0), 4, 4)
     assert "noise in 3 of 4 sessions" in sentences.describe_residual(best, 3, 4)
