@@ -237,6 +237,7 @@ def campaign(
     paths: Iterable[Path | str],
     settings: WelchSettings | None = None,
     *,
+    block_s: float | None = None,
     types: Sequence[str] | None = None,
     fixed: Sequence[Setting] = (),
     jobs: int | None = None,
@@ -250,6 +251,9 @@ def campaign(
         Session files.
     settings : WelchSettings, optional
         Settings of the Welch fits; by default those of the reference paper.
+    block_s : float, optional
+        Length in s of the blocks into which each session is divided. A block counts as a session,
+        and ``homogeneity`` of the result has the changes with time.
     types : sequence of str, optional
         Structures fitted to the whole records; by default all seven.
     fixed : sequence of str
@@ -279,6 +283,7 @@ def campaign(
     return run(
         [Path(path) for path in paths],
         settings,
+        block_s=block_s,
         structures=tuple(types or STRUCTURES),
         fixed_parameters=fixed,
         jobs=jobs,

@@ -315,7 +315,15 @@ def load_record(
 
 
 def may_be_longer(path: Path, sample_count: int) -> bool:
-    """Return whether a file may contain more than a number of samples, by its size."""
+    """Return whether a file may contain more than a number of samples, by its size.
+
+    Parameters
+    ----------
+    path
+        File, which need not exist.
+    sample_count
+        Number of samples.
+    """
     try:
         return path.stat().st_size > sample_count * _MIN_SAMPLE_BYTES
     except OSError:  # reported when the file is opened

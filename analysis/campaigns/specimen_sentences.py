@@ -54,7 +54,15 @@ def describe_specimens(homogeneity: Homogeneity) -> list[str]:
 
 
 def describe_blocks(homogeneity: Homogeneity, block_count: int) -> list[str]:
-    """Return a sentence that the sessions are blocks of one session, or an empty list."""
+    """Return a sentence that the sessions are blocks of one session, or an empty list.
+
+    Parameters
+    ----------
+    homogeneity : Homogeneity
+        Comparison of the sessions.
+    block_count : int
+        Number of sessions.
+    """
     if not homogeneity.is_one_session:
         return []
     return [f"The session is divided into {block_count} blocks. Here, each block is a session."]

@@ -443,6 +443,13 @@ def analyze(
                     block_s=block,
                 )  # fmt: skip
             except SingleSessionError as single:
+                if block is not None:
+                    print_error(
+                        "\n".join(failure.message for failure in single.failures)
+                        + f"\n{single.path}: only one block of {block:g} s can be used, and a "
+                        "comparison needs two: choose another --block, or leave it out."
+                    )
+                    raise typer.Exit(1) from None
                 exit_code = _report_single_session(single, options, output_options)
             except (CampaignError, SessionError, RecordError) as error:
                 print_error(str(error))
