@@ -241,7 +241,17 @@ class SessionFailure:
     def from_error(
         cls, source: RecordSource, error: Exception, experiment: Experiment | None
     ) -> SessionFailure:
-        """Return the failure of a session or a part of it by an error, which names the file."""
+        """Return the failure of a session or a part of it by an error, which names the file.
+
+        Parameters
+        ----------
+        source : RecordSource
+            Session file, or a part of it.
+        error : Exception
+            Error of its analysis.
+        experiment : Experiment or None
+            Specimen and excitation stated in the file.
+        """
         part_text = f"{source.part_name}: " if source.part_s else ""
         return cls(source, f"{part_text}{error}", experiment)
 
