@@ -62,8 +62,7 @@ class RecordSource:
         if self.part_s is None:
             return ""
         from_s, to_s = self.part_s
-        end_text = "end" if to_s is None else f"{to_s:g} s"
-        return f"{from_s or 0.0:g} to {end_text}"
+        return f"{from_s or 0.0:g} s to end" if to_s is None else f"{from_s or 0.0:g} to {to_s:g} s"
 
     def __str__(self) -> str:
         return f"{self.path}, {self.part_name}" if self.part_s else str(self.path)

@@ -158,7 +158,9 @@ def _describe_different_specimens(
     other_quantities_sentence = (
         f" The same holds for {', '.join(other_labels)}." if other_labels else ""
     )
-    groups_sentence = _describe_groups(leading_scatter)
+    groups_sentence = _describe_groups(
+        leading_scatter, "block" if homogeneity.is_one_session else "file"
+    )
     if homogeneity.is_one_session:
         return [
             "The antenna did not stay in one state during the session: "
@@ -213,8 +215,11 @@ def _describe_heterogeneity(scatter: Heterogeneity) -> str:
     )
 
 
-def _describe_groups(scatter: Heterogeneity) -> str:
-    """Describe the groups of sessions or, if there are none, the sessions with extreme values."""
+def _describe_groups(scatter: Heterogeneity, kind_text: str) -> str:
+    """Describe the groups of sessions or, if there are none, the sessions with extreme values.
+
+    `kind_text` is what a session is called: a file or a block.
+    """
     quantity_label, _, _ = label_and_unit(scatter.quantity)
     values_by_file = {
         file_name: (session_value, std)
@@ -223,7 +228,7 @@ def _describe_groups(scatter: Heterogeneity) -> str:
     if scatter.session_groups:
         groups_text = "; ".join(
             f"{_mean_text([values_by_file[file_name][0] for file_name in group], scatter)} in "
-            f"{_list_files(group)}"
+            f"{_list_files(group, kind_text)}"
             for group in scatter.session_groups
         )
         return (
@@ -255,9 +260,9 @@ def _mean_text(session_values: Sequence[float], scatter: Heterogeneity) -> str:
     ).rstrip()
 
 
-def _list_files(file_names: Sequence[str]) -> str:
-    """Return the number of files and the names of the first few."""
+def _list_files(file_names: Sequence[str], kind_text: str = "file") -> str:
+    """Return the number of files, or of another kind, and the names of the first few."""
     return (
-        f"{len(file_names)} file{'' if len(file_names) == 1 else 's'} "
+        f"{len(file_names)} {kind_text}{'' if len(file_names) == 1 else 's'} "
         f"({join_first_texts(file_names)})"
     )

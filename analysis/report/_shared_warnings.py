@@ -30,13 +30,15 @@ class FileWarnings(NamedTuple):
     warnings: Sequence[str]
 
 
-def shared_warnings(files: Sequence[FileWarnings]) -> list[str]:
+def shared_warnings(files: Sequence[FileWarnings], kinds_text: str = "files") -> list[str]:
     """Return the warnings of files, each once, in the order of their first occurrence.
 
     Parameters
     ----------
     files : sequence of FileWarnings
         All files, also those without a warning.
+    kinds_text : str
+        What the files are called, such as the blocks of one session.
 
     Returns
     -------
@@ -51,20 +53,20 @@ def shared_warnings(files: Sequence[FileWarnings]) -> list[str]:
             warning_text = sentence.replace(f"{file.path}: ", "")
             names_by_text.setdefault(warning_text, {})[file_index] = file.name
     return [
-        f"{_files_text(list(names.values()), len(files))}: {warning_text}"
+        f"{_files_text(list(names.values()), len(files), kinds_text)}: {warning_text}"
         for warning_text, names in names_by_text.items()
     ]
 
 
-def _files_text(names: Sequence[str], file_count: int) -> str:
+def _files_text(names: Sequence[str], file_count: int, kinds_text: str) -> str:
     """Return a text on the files that have a warning: their number and a few of their names."""
     if len(names) == 1:
         return names[0]
     if len(names) == file_count:
-        return f"all {file_count} files"
+        return f"all {file_count} {kinds_text}"
     named_files = ", ".join(names[:_MAX_NAMED_FILES])
     unnamed_count = len(names) - _MAX_NAMED_FILES
     return (
-        f"{len(names)} of {file_count} files ({named_files}"
+        f"{len(names)} of {file_count} {kinds_text} ({named_files}"
         f"{f' and {unnamed_count} more' if unnamed_count > 0 else ''})"
     )

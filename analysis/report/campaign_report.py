@@ -108,7 +108,8 @@ def _session_warnings(campaign: CampaignResult) -> list[str]:
         [
             FileWarnings(session.name, session.path, session.warnings)
             for session in campaign.sessions
-        ]
+        ],
+        "blocks" if campaign.homogeneity.is_one_session else "files",
     )
 
 

@@ -104,7 +104,7 @@ def loosening(made_once):
 def test_blocks_cover_the_session(steady):
     blocks = blocks_of_session(steady, 60.0)
     assert [block.part_s for block in blocks] == [(None, 60.0), (60.0, 120.0), (120.0, None)]
-    assert [block.part_name for block in blocks] == ["0 to 60 s", "60 to 120 s", "120 to end"]
+    assert [block.part_name for block in blocks] == ["0 to 60 s", "60 to 120 s", "120 s to end"]
     assert blocks[0].as_json() == {"file": str(steady), "from_s": None, "to_s": 60.0}
     assert RecordSource(steady).as_json() == {"file": str(steady)}
     # A remainder of less than half a block belongs to the last one.
