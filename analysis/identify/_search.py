@@ -70,8 +70,11 @@ _COARSE_POINTS: Final = 400
 """Number of points of the coarse response."""
 
 _MIN_EXCITED_POWER_RATIO: Final = 1e-2
-"""Minimum power of the angle in a bin of the coarse response, relative to the largest power nearby.
+"""Minimum power of the angle in a line of its spectrum, relative to the largest power nearby.
 Between the lines of a multisine, leakage and ringing are all that a transform shows."""
+
+_MAX_LINE_FRACTION: Final = 0.5
+"""Largest fraction of bins with this power in a spectrum that consists of lines."""
 
 _EXCITED_BAND_COUNT: Final = 100
 """Number of equal parts of the band, in each of which the powers are compared."""
@@ -122,9 +125,10 @@ class CoarseResponse:
             np.maximum.reduceat(angle_power, part_starts),
             np.diff(part_starts, append=angle_power.size),
         )
-        is_excited = (angle_power > 1e-12 * angle_power.max()) & (
-            angle_power > _MIN_EXCITED_POWER_RATIO * largest_power_nearby
-        )
+        is_excited = angle_power > 1e-12 * angle_power.max()
+        is_line = angle_power > _MIN_EXCITED_POWER_RATIO * largest_power_nearby
+        if np.count_nonzero(is_line) < _MAX_LINE_FRACTION * is_line.size:
+            is_excited &= is_line
         measured_response, response_weights = (
             torque_spectrum[is_excited] / angle_spectrum[is_excited],
             angle_power[is_excited],
