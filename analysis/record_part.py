@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.record_checks import RecordError, first_mode_hz, stated_rate_hz
+from analysis.record_checks import RecordError, first_mode_hz, stated_beam, stated_rate_hz
 from rigd.session import (
     SessionError,
+    limits,
     linear_sweep_band_hz,
     read_session,
     read_summary,
@@ -22,6 +23,8 @@ from rigd.session import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from rigd.beam import Beam
     from rigd.session import Session
@@ -35,6 +38,12 @@ part, and a shorter part does not distinguish this ringing from the response to 
 
 _TICK_TOLERANCE: Final = 1e-3
 """Tolerance in ticks for the rounding of a time that is stated in seconds."""
+
+_MAX_GAP_BEFORE_PART_S: Final = 1.0
+"""Longest time without a sample before a part that was read by the times of its chunks."""
+
+_SINGLE_MOTIONS: Final = ("step", "move", "touch")
+"""Excitations that are one motion: blocks of them have nothing in common."""
 
 BLOCK_S: Final = 900.0
 """Default length in seconds of the blocks of a long session."""
@@ -90,36 +99,40 @@ def blocks_of_session(path: Path, block_s: float = BLOCK_S) -> tuple[RecordSourc
     SessionError
         The file cannot be read or is damaged.
     RecordError
-        The session is too short for two blocks, or is a linear sweep, whose blocks have different
-        frequencies.
+        The blocks are too short for an estimate, the session is too short for two of them, or it
+        is a linear sweep or a single motion.
     """
     summary = read_summary(path)
     if summary.samples is None:
         raise SessionError(f"{path}: {summary.problem}")
     metadata = summary.metadata
+    if metadata.get("excitation") in _SINGLE_MOTIONS:
+        raise RecordError(
+            f"{path}: a {metadata['excitation']} is one motion, whose blocks cannot be compared. "
+            "Record several and analyse them together."
+        )
     if linear_sweep_band_hz(metadata.get("excitation", ""), metadata) is not None:
         raise RecordError(
             f"{path}: blocks of one sweep have different frequencies, so they do not show what "
             "changes with time. Record several sweeps (rigd run chirp --repeat) and analyse them "
             "together, or a part of this one (--from, --to)."
         )
-    try:
-        rate_hz = float(metadata["rate_hz"])
-    except (KeyError, ValueError):
-        rate_hz = math.nan
-    if not 0.0 < rate_hz < math.inf:
-        raise RecordError(
-            f"{path}: rate_hz in the metadata 'session' is missing or no number in Hz. The writing "
-            "program must state it."
-        )
-    duration_s = summary.samples / rate_hz
+    read_ticks = partial(
+        read_session, path, fields=("t_ns", "tick"), max_samples=limits.MAX_RECORDED_SAMPLES
+    )
+    beginning = read_ticks(part_s=(0.0, 0.0))
+    if len(beginning.samples) == 0:  # the record begins later
+        beginning = read_ticks()
+    rate_hz, first_tick = stated_rate_hz(beginning), int(beginning.samples["tick"][:1].sum())
+    check_part_length(path, (0.0, block_s), stated_beam(beginning, rate_hz, summary.samples))
+    first_s, duration_s = first_tick / rate_hz, summary.samples / rate_hz
     block_count = math.floor(duration_s / block_s + 0.5)
     if block_count < 2:
         raise RecordError(
             f"{path}: {duration_s:g} s are too short for two blocks of {block_s:g} s; choose a "
             "shorter --block."
         )
-    limits_s = [block_s * number for number in range(1, block_count)]
+    limits_s = [first_s + block_s * number for number in range(1, block_count)]
     return tuple(
         RecordSource(path, part_s)
         for part_s in zip([None, *limits_s], [*limits_s, None], strict=True)
@@ -155,11 +168,26 @@ def read_session_part(
         interval_s = (part_s[0] or 0.0, math.inf if part_s[1] is None else part_s[1])
         with suppress(SessionError):  # raised again if the whole file has the error
             session = read(part_s=interval_s)
-            if len(session.samples):
-                end_s = (int(session.samples["tick"][-1]) + 1) / stated_rate_hz(session)
-                if interval_s[0] < end_s and (part_s[1] is None or part_s[1] <= end_s):
-                    return session, interval_s
+            if _contains_part(session.samples["tick"], part_s, stated_rate_hz(session)):
+                return session, interval_s
     return read(), None
+
+
+def _contains_part(ticks: NDArray[np.int64], part_s: PartOption, rate_hz: float) -> bool:
+    """Return whether the ticks that were read begin shortly before a part, and end after it.
+
+    If not, the file states wrong times of its chunks, or the part is not in the record.
+    """
+    first_tick, end_tick = (None if time_s is None else time_s * rate_hz for time_s in part_s)
+    if len(ticks) == 0 or not (end_tick is None or end_tick <= ticks[-1] + 1):
+        return False
+    if first_tick is None or first_tick <= ticks[0]:
+        return True
+    earlier_ticks = ticks[ticks < first_tick]
+    longest_gap_ticks = max(_MAX_GAP_BEFORE_PART_S * rate_hz, 1.0)
+    return bool(
+        len(earlier_ticks) < len(ticks) and first_tick - earlier_ticks[-1] <= longest_gap_ticks
+    )
 
 
 def part_of_session(

@@ -94,7 +94,8 @@ class Experiment:
     start_utc : str
         Start of the recording in UTC, to the second; empty if the file does not state it.
     middle_utc_s : float or None
-        Middle of the record in seconds since 1970; None if the file does not state its start.
+        Middle of the record in seconds since 1970; if the file does not state its start, that of a
+        part since the session's start, and None for a whole session.
     operator, note : str
         Operator and note stated in the file; empty if not stated.
     added_metadata : mapping of str to (float or str)
@@ -137,7 +138,7 @@ class Experiment:
                 ),
                 *(() if record.part_text is None else (record.part_text,)),
             ),
-            start_utc=_utc_text(metadata.get("start_utc_ns", "")),
+            start_utc=_utc_text(metadata.get("start_utc_ns", ""), record.part_s),
             middle_utc_s=_middle_utc_s(record),
             operator=metadata.get("operator", "").strip(),
             note=metadata.get("note", "").strip(),
@@ -392,20 +393,28 @@ def fact_text(fact_key: str, fact_value: str | float) -> str:
     return f"{fact_value:g} {unit_of(fact_key)}".rstrip()
 
 
-def _utc_text(utc_ns: str) -> str:
-    """Format nanoseconds since 1970 in UTC as ISO 8601, to the second; empty if not a number."""
+def _utc_text(utc_ns: str, part_s: tuple[float, float] | None) -> str:
+    """Format the start of a session or a part in UTC as ISO 8601, to the second.
+
+    The text is empty if the start of the session (nanoseconds since 1970) is not a number.
+    """
     try:
-        return f"{datetime.fromtimestamp(int(utc_ns) // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}"
+        start_s = int(utc_ns) // 10**9 + int(part_s[0] if part_s else 0)
+        return f"{datetime.fromtimestamp(start_s, UTC):%Y-%m-%dT%H:%M:%SZ}"
     except (ValueError, OverflowError, OSError):
         return ""
 
 
 def _middle_utc_s(record: Record) -> float | None:
-    """Return the middle of a record in seconds since 1970; None if its start is not stated."""
+    """Return the middle of a record in seconds since 1970, or of a part since the start.
+
+    None if the start of a whole session is not stated.
+    """
+    middle_s = float(record.time_s[0] + record.time_s[-1]) / 2
     start_utc_ns = record.metadata.get("start_utc_ns", "")
-    if not (start_utc_ns.isascii() and start_utc_ns.isdigit()):
-        return None
-    return int(start_utc_ns) / 1e9 + float(record.time_s[0] + record.time_s[-1]) / 2
+    if start_utc_ns.isascii() and start_utc_ns.isdigit() and len(start_utc_ns) < 20:
+        return int(start_utc_ns) / 1e9 + middle_s
+    return None if record.part_s is None else middle_s
 
 
 def _parse_number(number_text: str) -> str | float:

@@ -436,7 +436,7 @@ def describe_scatter(homogeneity: Homogeneity) -> list[str]:
     """Describe whether any quantity varies significantly between the sessions.
 
     The level of the test gives one false alarm in a hundred campaigns. The list is empty if nothing
-    could be compared.
+    could be compared, or if the only variance is a change with time.
     """
     if not homogeneity.quantities:
         return []
@@ -445,6 +445,10 @@ def describe_scatter(homogeneity: Homogeneity) -> list[str]:
         for scatter in homogeneity.quantities
         if scatter.p_value < homogeneity.significance_level
     ]
+    if not varying_labels and any(
+        scatter.has_significant_trend for scatter in homogeneity.quantities
+    ):
+        return []  # a straight line is a more sensitive test of the same variance
     if not varying_labels:
         lowest_p_value = min(scatter.p_value for scatter in homogeneity.quantities)
         tau_remark = (

@@ -76,10 +76,12 @@ def describe_trends(homogeneity: Homogeneity) -> list[str]:
     trends = [scatter.trend for scatter in homogeneity.quantities if scatter.trend is not None]
     if not trends:
         return []
-    covered_text = f"over {max(trend.covered_h for trend in trends):.3g} h"
     changing_quantities = [
         scatter for scatter in homogeneity.quantities if scatter.has_significant_trend
     ]
+    if changing_quantities:
+        trends = [scatter.trend for scatter in changing_quantities if scatter.trend is not None]
+    covered_text = f"over {max(trend.covered_h for trend in trends):.3g} h"
     if changing_quantities:
         slopes_text = "; ".join(map(_slope_text, changing_quantities))
         return [

@@ -363,7 +363,9 @@ def analyze(
     if block is None and from_s is None and to_s is None and len(files) == 1 and not each:
         block = _block_length_of_long_session(files[0])
     elif block is not None:
-        _check_block_option(block, files, has_part=from_s is not None or to_s is not None)
+        _check_block_option(
+            block, files, has_part=from_s is not None or to_s is not None, is_each=each
+        )
     is_campaign = (len(files) > 1 and not each) or block is not None
     if not is_campaign:
         campaign_options = {
@@ -486,7 +488,9 @@ def _block_length_of_long_session(session_file: Path) -> float | None:
     return BLOCK_S
 
 
-def _check_block_option(block_s: float, files: Sequence[Path], *, has_part: bool) -> None:
+def _check_block_option(
+    block_s: float, files: Sequence[Path], *, has_part: bool, is_each: bool
+) -> None:
     """Raise a usage error if --block has no usable length, or is not for one whole session."""
     usage_reason = None
     if not 0.0 < block_s < math.inf:
@@ -495,6 +499,8 @@ def _check_block_option(block_s: float, files: Sequence[Path], *, has_part: bool
         usage_reason = f"it takes one session, and {len(files)} files were given."
     elif has_part:
         usage_reason = "it divides the whole session; leave --from and --to out."
+    elif is_each:
+        usage_reason = "the blocks are compared, not reported by themselves; leave --each out."
     if usage_reason is not None:
         raise typer.BadParameter(usage_reason, param_hint="--block")
 

@@ -33,7 +33,9 @@ def trend_figure(campaign: CampaignResult) -> Figure:
 
     scatters = [scatter for scatter in campaign.homogeneity.quantities if scatter.trend]
     times_s = {
-        session.name: session.experiment.middle_utc_s or 0.0 for session in campaign.sessions
+        session.name: session.experiment.middle_utc_s
+        for session in campaign.sessions
+        if session.experiment.middle_utc_s is not None
     }
     first_s = min(times_s.values())
     times_h = {name: (time_s - first_s) / 3600 for name, time_s in times_s.items()}

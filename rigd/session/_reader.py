@@ -14,6 +14,7 @@ import numpy.typing as npt
 from rigd.session import limits
 from rigd.session._contents import load_contents, recovery_advice
 from rigd.session._errors import SessionError
+from rigd.session._mcap_limits import McapDamageError
 from rigd.session._mcap_reader import IsChunkNeeded, McapContents, MessageBlock, OnBlock
 from rigd.session._mcap_writer import MESSAGE_HEAD_FORMAT
 from rigd.session._message_decoder import (
@@ -423,35 +424,43 @@ class _UndecodedLog:
 
 
 class _ChunksOfPart:
-    """Selection of the chunks of a part of a session and of its segment ``rest``.
+    """Selection of the first chunk, and of those of a part and of the segment ``rest``.
 
     Every chunk is selected of a file that does not state its rate and its start before the samples.
+    The chunks of the part follow each other in the file. If others are between them, their stated
+    times are wrong, and `McapDamageError` is raised.
     """
 
     def __init__(self, part_s: tuple[float, float]) -> None:
         self._part_s = part_s
         self._log_time_ranges: list[tuple[float, float]] | None = None  # of rest and part
+        self._part_state = "before"  # whether the chunk is before, in or after the part
 
     def __call__(self, contents: McapContents, first_log_time: int, last_log_time: int) -> bool:
         """Return whether a chunk with messages between two log times is needed."""
+        is_first = self._log_time_ranges is None  # it may declare the channels of all
         if self._log_time_ranges is None:
-            if not contents.channels:  # they may be declared in the first chunk alone
-                return True
             self._log_time_ranges = self._ranges_of_log_time(contents)
-        return any(
-            first_log_time <= last and last_log_time >= first
-            for first, last in self._log_time_ranges
-        )
+        (rest_first, rest_last), (part_first, part_last) = self._log_time_ranges
+        is_in_rest = first_log_time <= rest_last and last_log_time >= rest_first
+        if first_log_time <= part_last and last_log_time >= part_first:
+            if self._part_state == "after":
+                raise McapDamageError("states times of its chunks that do not increase")
+            self._part_state = "in"
+            return True
+        if self._part_state == "in":
+            self._part_state = "after"
+        return is_first or is_in_rest
 
     def _ranges_of_log_time(self, contents: McapContents) -> list[tuple[float, float]]:
         """Return first and last log time in ns of rest and part, with a margin around each."""
         metadata = merged_metadata(contents, "session") or {}
         segments = merged_metadata(contents, "segments") or {}
         try:
-            start_utc_ns = int(metadata["start_utc_ns"])
+            start_utc_ns = np.uint64(metadata["start_utc_ns"]).item()
             rest_end_s = int(segments.get("rest", "0,0").split(",")[1]) / float(metadata["rate_hz"])
         except (KeyError, ValueError, ArithmeticError, IndexError):
-            return [(-inf, inf)]
+            return [(-inf, inf), (-inf, inf)]
 
         def log_time(time_s: float, side: int) -> float:
             margin_s = _PART_MARGIN_S + _MAX_CLOCK_DEVIATION * abs(time_s)

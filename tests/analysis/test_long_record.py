@@ -7,6 +7,7 @@ import pytest
 
 from analysis import api
 from analysis.decimation import Decimation
+from analysis.exchange import export_record
 from analysis.identify import BAND_HZ, Measurement, fit_freest_alone
 from analysis.record import RecordError, load_record, record_of
 from rigd.session import read_session
@@ -55,6 +56,20 @@ def test_part_of_a_long_file_is_that_of_the_whole(paper_file, part_s):
         )
     for name in ("rate_hz", "sweep", "rest_angle_rad", "gaps", "part_s", "swept_hz", "warnings"):
         assert getattr(found, name) == getattr(expected, name)
+
+
+@pytest.mark.parametrize("time_of", ["stalls", "is shifted"])
+def test_part_is_whole_if_its_time_stamps_are_wrong(tmp_path, write_session, make_signals, time_of):
+    """The chunks of a part are found by their times, and its samples by their ticks."""
+    signals = make_signals(sweep_s=60.0)
+    t_ns = np.arange(len(signals.angle_rad)) * 1_000_000
+    if time_of == "stalls":  # for 20 s, and then goes on
+        t_ns = np.maximum(np.minimum(t_ns, 10_000_000_000), t_ns - 20_000_000_000)
+    else:
+        t_ns = t_ns + 15_000_000_000
+    path = write_session(tmp_path / "a.mcap", signals, t_ns=t_ns)
+    table = export_record(path, tmp_path / "a.csv", part_s=(40.0, 60.0))
+    assert table.columns[0].values.tolist() == list(range(40_000, 60_000))
 
 
 @pytest.mark.parametrize(

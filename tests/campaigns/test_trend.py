@@ -113,14 +113,30 @@ def test_blocks_cover_the_session(steady):
     ]  # fmt: skip
 
 
-def test_sessions_that_cannot_be_divided(steady, paper_file, tmp_path):
+def test_sessions_that_cannot_be_divided(steady, paper_file, short_signals, tmp_path):
     with pytest.raises(RecordError, match=r"200 s are too short for two blocks of 150 s"):
         blocks_of_session(steady, 150.0)
     with pytest.raises(RecordError, match=r"blocks of one sweep .* --repeat"):
         blocks_of_session(paper_file, 30.0)
+    with pytest.raises(RecordError, match=r"too short for an estimate, .* 3.92 s"):
+        blocks_of_session(steady, 1e-6)
+    metadata = {"excitation": "step"}
+    step = write_session(tmp_path / "step.mcap", short_signals, metadata=metadata)
+    with pytest.raises(RecordError, match="a step is one motion"):
+        blocks_of_session(step, 2.0)
     (tmp_path / "cut.mcap").write_bytes(steady.read_bytes()[:-100_000])
     with pytest.raises(SessionError, match="is incomplete; save what is intact"):
         blocks_of_session(tmp_path / "cut.mcap", 40.0)
+
+
+def test_blocks_of_a_record_that_begins_late(write_session, short_signals, tmp_path):
+    ticks = 30_000 + np.arange(5000)
+    path = write_session(
+        tmp_path / "a.mcap", short_signals, ticks=ticks, segments={},
+        metadata={"excitation": "multisine", "beam_length_m": "0.3"},
+    )  # fmt: skip
+    blocks = blocks_of_session(path, 2.5)
+    assert [block.part_s for block in blocks] == [(None, 32.5), (32.5, None)]
 
 
 @pytest.mark.fit
@@ -166,6 +182,7 @@ def test_steady_session_is_not_called_a_change(
     [
         (("a.mcap", "b.mcap", "--block", "9"), "it takes one session, and 2 files were given"),
         (("a.mcap", "--block", "9", "--from", "1"), "leave --from and --to out"),
+        (("a.mcap", "--block", "9", "--each"), "leave --each out"),
         (("a.mcap", "--block", "0"), "0 s must be more than 0"),
         (("a.mcap", "--block", "nan"), "nan s must be more than 0"),
     ],
