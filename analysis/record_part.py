@@ -85,14 +85,14 @@ class RecordSource:
 
 
 def blocks_of_session(path: Path, block_s: float = BLOCK_S) -> tuple[RecordSource, ...]:
-    """Divide a session into consecutive blocks of equal length; only the last may be longer.
+    """Divide a session into consecutive blocks of equal length; the last one may differ by half.
 
     Parameters
     ----------
     path : Path
         Session file.
     block_s : float
-        Length of the blocks in seconds. The last one also covers a remainder of less than half.
+        Length of the blocks in seconds. A remainder of less than half belongs to the last one.
 
     Raises
     ------
