@@ -173,6 +173,8 @@ class Measurement:
     is_single_sweep : bool
         Whether the motor passed each frequency once, in rising or falling order. An effect of time
         then cannot be distinguished from an effect of frequency.
+    is_later_part : bool
+        Whether the record is a part of a session that begins after its rest.
     torque_extremes : tuple of TorqueExtreme
         Largest and smallest torque before a decimation of the record; empty without one.
     """
@@ -195,6 +197,7 @@ class Measurement:
     tip_mass_kg: float | None = None
     axis_tilt_deg: float | None = None
     is_single_sweep: bool = True
+    is_later_part: bool = False
     torque_extremes: tuple[TorqueExtreme, ...] = ()
 
     @classmethod
@@ -230,6 +233,7 @@ class Measurement:
             axis_tilt_deg=record.axis_tilt_deg,
             is_single_sweep=record.metadata.get("excitation", "chirp") == "chirp"
             and record.outward_sweep is None,
+            is_later_part=record.part_s is not None and record.rest_angle_rad is None,
             torque_extremes=record.torque_extremes,
         )
 

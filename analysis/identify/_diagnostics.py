@@ -262,7 +262,9 @@ def _initial_ringing_findings(candidate_set: CandidateSet, headline: Headline) -
         ),
         value=largest_ringing_nm,
         unit="N·m",
-        remedy="Wait longer at rest before the sweep.",
+        remedy=""
+        if candidate_set.comparison.measurement.is_later_part
+        else "Wait longer at rest before the sweep.",
     )
 
 

@@ -27,6 +27,7 @@ RECORD = SimpleNamespace(
     tip_mass_kg=None,
     axis_tilt_deg=None,
     outward_sweep=None,
+    part_s=None,
 )
 
 
