@@ -73,6 +73,11 @@ class RecordSource:
         from_s, to_s = self.part_s
         return f"{from_s or 0.0:g} s to end" if to_s is None else f"{from_s or 0.0:g} to {to_s:g} s"
 
+    @property
+    def name(self) -> str:
+        """Name of the part, or of the file if its whole session is analysed."""
+        return self.part_name or self.path.name
+
     def __str__(self) -> str:
         return f"{self.path}, {self.part_name}" if self.part_s else str(self.path)
 

@@ -205,13 +205,10 @@ def campaign(
         raise CampaignError("A campaign needs session files, and none was given.")
     if dask_address is not None:
         paths = [path.absolute() for path in paths]
-    sources = [
-        source
-        for path in paths
-        for source in (
-            [RecordSource(path)] if block_s is None else blocks_of_session(path, block_s)
-        )
-    ]
+    if block_s is None:
+        sources = [RecordSource(path) for path in paths]
+    else:
+        sources = [block for path in paths for block in blocks_of_session(path, block_s)]
     settings = settings or WelchSettings()
     session_task = SessionTask(
         settings, tuple(structures), tuple(fixed_parameters), band_hz, uniformity
@@ -235,7 +232,7 @@ def campaign(
         session_results = ready_workers.run(
             analyse_session,
             [(source, session_task) for source in sources],
-            lambda i: report_step(sources[i].part_name or sources[i].path.name),
+            lambda i: report_step(sources[i].name),
         )
         sessions, failures = _separate_experiments(
             [

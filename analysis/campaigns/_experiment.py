@@ -236,7 +236,7 @@ class SessionFailure:
     """Name in tables (see `distinct_names`); the name of the file by default."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", self.name or self.source.part_name or self.path.name)
+        object.__setattr__(self, "name", self.name or self.source.name)
 
     @classmethod
     def from_error(

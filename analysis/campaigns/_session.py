@@ -119,7 +119,7 @@ class SessionAnalysis:
     uniformity: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", self.name or self.source.part_name or self.path.name)
+        object.__setattr__(self, "name", self.name or self.source.name)
 
     @property
     def path(self) -> Path:

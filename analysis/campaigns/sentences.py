@@ -445,11 +445,9 @@ def describe_scatter(homogeneity: Homogeneity) -> list[str]:
         for scatter in homogeneity.quantities
         if scatter.p_value < homogeneity.significance_level
     ]
-    if not varying_labels and any(
-        scatter.has_significant_trend for scatter in homogeneity.quantities
-    ):
-        return []  # a straight line is a more sensitive test of the same variance
     if not varying_labels:
+        if any(scatter.has_significant_trend for scatter in homogeneity.quantities):
+            return []  # a straight line is a more sensitive test of the same variance
         lowest_p_value = min(scatter.p_value for scatter in homogeneity.quantities)
         tau_remark = (
             "; the τ above zero are within chance"
@@ -526,8 +524,7 @@ def describe_failed_predictions(
     if not failed_predictions:
         return []
     reason_texts = [
-        f"{failed_prediction.source.part_name or failed_prediction.source.path.name}: "
-        f"{failed_prediction.reason}"
+        f"{failed_prediction.source.name}: {failed_prediction.reason}"
         for failed_prediction in failed_predictions
     ]
     return [

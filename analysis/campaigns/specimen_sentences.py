@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._experiment import StatedSpecimen
     from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionEstimates
+    from analysis.campaigns.trend import Trend
 
 MIXTURE_MARK: Final = "‡"
 """Mark of values in tables and figures that are pooled over different specimens."""
@@ -73,42 +74,36 @@ def describe_trends(homogeneity: Homogeneity) -> list[str]:
 
     That nothing changes is stated of the blocks of one session only.
     """
-    trends = [scatter.trend for scatter in homogeneity.quantities if scatter.trend is not None]
-    if not trends:
-        return []
-    changing_quantities = [
-        scatter for scatter in homogeneity.quantities if scatter.has_significant_trend
+    trends = [
+        (scatter.quantity, scatter.trend, scatter.has_significant_trend)
+        for scatter in homogeneity.quantities
+        if scatter.trend is not None
     ]
-    if changing_quantities:
-        trends = [scatter.trend for scatter in changing_quantities if scatter.trend is not None]
-    covered_text = f"over {max(trend.covered_h for trend in trends):.3g} h"
-    if changing_quantities:
-        slopes_text = "; ".join(map(_slope_text, changing_quantities))
+    significant_trends = [trend for trend in trends if trend[-1]]
+    if not (significant_trends or (trends and homogeneity.is_one_session)):
+        return []
+    covered_h = max(trend.covered_h for _, trend, _ in significant_trends or trends)
+    if significant_trends:
+        slopes_text = "; ".join(_slope_text(name, trend) for name, trend, _ in significant_trends)
         return [
-            f"Change with time {covered_text} (straight lines, 95 %): {slopes_text}. Pooled values "
-            "are means over this time."
+            f"Change with time over {covered_h:.3g} h (straight lines, 95 %): {slopes_text}. "
+            "Pooled values are means over this time."
         ]
-    if not homogeneity.is_one_session:
-        return []
-    lowest_p_value = min(trend.p_value for trend in trends)
-    first_quantity = next(
-        scatter for scatter in homogeneity.quantities if scatter.trend is not None
-    )
+    lowest_p_value = min(trend.p_value for _, trend, _ in trends)
     return [
-        f"No significant change with time {covered_text} (straight lines, lowest p of "
-        f"{len(trends)}: {format_p_value(lowest_p_value)}): {_slope_text(first_quantity)}."
+        f"No significant change with time over {covered_h:.3g} h (straight lines, lowest p of "
+        f"{len(trends)}: {format_p_value(lowest_p_value)}): {_slope_text(*trends[0][:2])}."
     ]
 
 
-def _slope_text(scatter: Heterogeneity) -> str:
+def _slope_text(quantity: str, trend: Trend) -> str:
     """Describe the change of a quantity per hour, with its 95 % interval as a half width."""
-    assert scatter.trend is not None
-    quantity_label, factor, display_unit = label_and_unit(scatter.quantity)
-    half_width = (scatter.trend.interval_95_per_h[1] - scatter.trend.interval_95_per_h[0]) / 2
+    quantity_label, factor, display_unit = label_and_unit(quantity)
+    half_width = (trend.interval_95_per_h[1] - trend.interval_95_per_h[0]) / 2
     slope_text, half_width_text = rounded_to_uncertainty(
-        (scatter.trend.slope_per_h, half_width), half_width, factor
+        (trend.slope_per_h, half_width), half_width, factor
     )
-    sign_text = "+" if scatter.trend.slope_per_h > 0 else ""
+    sign_text = "+" if trend.slope_per_h > 0 else ""
     unit_text = f" {display_unit}" if display_unit else ""
     return f"{quantity_label} by {sign_text}{slope_text} ± {half_width_text}{unit_text} per hour"
 

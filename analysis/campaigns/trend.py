@@ -40,6 +40,8 @@ class Trend:
         p-value of no change.
     covered_h : float
         Time in hours from the middle of the first session to that of the last.
+    centre : tuple of float
+        Weighted means of the times in seconds and of the estimates, through which the line passes.
     """
 
     slope_per_h: float
@@ -47,6 +49,12 @@ class Trend:
     interval_95_per_h: tuple[float, float]
     p_value: float
     covered_h: float
+    centre: tuple[float, float]
+
+    def value_at(self, time_s: float) -> float:
+        """Return the value of the line at a time in seconds."""
+        centre_s, centre_value = self.centre
+        return centre_value + self.slope_per_h * (time_s - centre_s) / 3600
 
 
 def linear_trend(
@@ -81,7 +89,8 @@ def linear_trend(
     if covered_h < _MIN_COVERED_H:
         return None
     weights = 1 / np.array(stds) ** 2
-    centred_h = times_h - weights @ times_h / weights.sum()
+    mean_h = weights @ times_h / weights.sum()
+    centred_h = times_h - mean_h
     time_variance = float(weights @ centred_h**2)
     values = np.array(estimates)
     mean = weights @ values / weights.sum()
@@ -97,4 +106,5 @@ def linear_trend(
         (slope - half_width, slope + half_width),
         student_t_p_value(slope / slope_std, degrees_of_freedom),
         covered_h,
+        (3600 * float(mean_h), float(mean)),
     )

@@ -322,13 +322,13 @@ def _find_line_groups(
     return groups_with_skirts
 
 
-def _lasts_through_record(residual: NDArray[np.complex128], line_bins: slice) -> bool:
-    """Return whether the disturbance in the bins `line_bins` lasts through the whole record.
+def _lasts_through_record(spectrum: NDArray[np.complex128], line_bins: slice) -> bool:
+    """Return whether the part of a spectrum in `line_bins` lasts through the whole record.
 
     The residual of a wrong model at a mode does not: it begins when the sweep passes the mode, and
     decays.
     """
-    bins_around = residual[
+    bins_around = spectrum[
         max(line_bins.start - _LINE_SURROUNDING_BINS, 0) : line_bins.stop + _LINE_SURROUNDING_BINS
     ]
     padded_length = _RECORD_PART_COUNT * (-(-4 * bins_around.size // _RECORD_PART_COUNT))

@@ -37,15 +37,14 @@ def trend_figure(campaign: CampaignResult) -> Figure:
         for session in campaign.sessions
         if session.experiment.middle_utc_s is not None
     }
-    first_s = min(times_s.values())
-    times_h = {name: (time_s - first_s) / 3600 for name, time_s in times_s.items()}
     row_count = -(-len(scatters) // _PANELS_PER_ROW)
     width_in, height_in = 13.0, _PANEL_HEIGHT_IN * row_count + 1.35
     kind_text = "blocks" if campaign.homogeneity.is_one_session else "sessions"
     figure = style.new_figure(
         width_in,
         height_in,
-        f"Change with time over {max(times_h.values()):.3g} h, {len(times_h)} {kind_text}",
+        f"Change with time over {(max(times_s.values()) - min(times_s.values())) / 3600:.3g} h, "
+        f"{len(times_s)} {kind_text}",
         f"each fitted by itself  ·  parameters: type {campaign.homogeneity.structure}  ·  "
         "p: p-value of no change",
     )
@@ -57,7 +56,7 @@ def trend_figure(campaign: CampaignResult) -> Figure:
         panel_axes = figure.add_subplot(
             grid[panel_number // _PANELS_PER_ROW, panel_number % _PANELS_PER_ROW]
         )
-        _draw_trend(panel_axes, scatter, times_h)
+        _draw_trend(panel_axes, scatter, times_s)
         if panel_number + _PANELS_PER_ROW >= len(scatters):
             panel_axes.set_xlabel("Time (h)", labelpad=1)
     legend_handles = [
@@ -70,15 +69,16 @@ def trend_figure(campaign: CampaignResult) -> Figure:
     return figure
 
 
-def _draw_trend(axes: Axes, scatter: Heterogeneity, times_h: Mapping[str, float]) -> None:
+def _draw_trend(axes: Axes, scatter: Heterogeneity, times_s: Mapping[str, float]) -> None:
     """Draw the estimates of one quantity against time, and the line through them."""
     assert scatter.trend is not None
     quantity_label, display_factor, _ = label_and_unit(scatter.quantity)
     file_names, estimates, stds = zip(*scatter.session_estimates, strict=True)
-    session_h, values = np.array([times_h[name] for name in file_names]), np.array(estimates)
+    first_s = min(times_s.values())
+    session_s = np.array([times_s[name] for name in file_names])
     axes.errorbar(
-        session_h,
-        display_factor * values,
+        (session_s - first_s) / 3600,
+        display_factor * np.array(estimates),
         yerr=NORMAL_95 * display_factor * np.array(stds),
         fmt="o",
         markersize=2.6,
@@ -86,11 +86,12 @@ def _draw_trend(axes: Axes, scatter: Heterogeneity, times_h: Mapping[str, float]
         linewidth=0.8,
     )
     if scatter.has_significant_trend:
-        weights = 1 / np.array(stds) ** 2
-        mean_h, mean_value = weights @ session_h / weights.sum(), weights @ values / weights.sum()
-        ends_h = np.array([session_h.min(), session_h.max()])
-        line_values = mean_value + scatter.trend.slope_per_h * (ends_h - mean_h)
-        axes.plot(ends_h, display_factor * line_values, color=style.VERMILION)
+        ends_s = session_s.min(), session_s.max()
+        axes.plot(
+            [(end_s - first_s) / 3600 for end_s in ends_s],
+            [display_factor * scatter.trend.value_at(end_s) for end_s in ends_s],
+            color=style.VERMILION,
+        )
     p_value_text = f"p = {format_p_value(scatter.trend.p_value)}".replace("= <", "<")
     axes.set_title(f"{quantity_label}   {p_value_text}")
     axes.set_ylabel(symbol_with_unit(scatter.quantity))
