@@ -258,8 +258,8 @@ def test_session_ends_with_a_stop_or_its_daemon(serve, stop_here, rigd):
     _, log = daemon.communicate(timeout=300.0)
     assert daemon.returncode == 130
     assert "stopping -> ready" in log
-    out, _ = client.communicate(timeout=300.0)
-    assert client.returncode == 130
+    out, err = client.communicate(timeout=300.0)
+    assert client.returncode == 130, (out, err, log)
     assert json.loads(out)["sessions"][0]["outcome"] == "stopped"
     assert not Path(f"/proc/{control}").exists()
     assert not socket_path("sim").exists()
