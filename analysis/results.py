@@ -9,14 +9,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from analysis.identify import RecordAnalysis, RecordFit, Selection, Setting, StructureFit
+    from analysis.identify import (
+        Measurement,
+        RecordAnalysis,
+        RecordFit,
+        Selection,
+        Setting,
+        StructureFit,
+    )
     from analysis.identify.headline import Headline
     from analysis.identify.verdict import OrderVerdict, Verdict
     from analysis.models import WelchSettings
@@ -312,6 +319,9 @@ def whole_record(
 ) -> WholeRecord:
     """Fit every damping structure to a whole record, and select the best supported one.
 
+    The fits are stored in the user's cache, and read there if they were computed before (see
+    `analysis.fit_cache`).
+
     Parameters
     ----------
     record : Record
@@ -326,15 +336,55 @@ def whole_record(
     MeasurementError
         The record cannot be used, or not in this band.
     """
+    from analysis.fit_cache import FitCache
+    from analysis.identify import select
+
+    if (stored_fits := stored_whole_record(record, fixed_parameters, band_hz)) is not None:
+        return stored_fits
+    measurement, band_hz = _fitted_measurement(record, band_hz)
+    selection = select(measurement, fixed_settings=fixed_parameters, band_hz=band_hz)
+    if (fit_cache := FitCache.of_user()) is not None:
+        fit_cache.store(selection, measurement, fixed_parameters, band_hz)
+    return WholeRecord(record, selection, band_hz, fixed_parameters)
+
+
+def stored_whole_record(
+    record: Record,
+    fixed_parameters: tuple[Setting, ...] = (),
+    band_hz: tuple[float, float] | None = None,
+) -> WholeRecord | None:
+    """Return the result of `whole_record` if the user's cache has these fits, else None.
+
+    Parameters
+    ----------
+    record, fixed_parameters, band_hz
+        Arguments of :func:`whole_record`.
+
+    Raises
+    ------
+    MeasurementError
+        The record cannot be used, or not in this band.
+    """
+    from analysis.fit_cache import FitCache
+
+    measurement, band_hz = _fitted_measurement(record, band_hz)
+    if (fit_cache := FitCache.of_user()) is None:
+        return None
+    selection = fit_cache.find(measurement, fixed_parameters, band_hz)
+    if selection is None:
+        return None
+    return WholeRecord(record, selection, band_hz, fixed_parameters)
+
+
+def _fitted_measurement(
+    record: Record, band_hz: tuple[float, float] | None
+) -> tuple[Measurement, tuple[float, float]]:
+    """Return the measurement of a record to which structures are fitted, and the fits' band."""
     from analysis.applicability import check_excited_band, record_band_hz
-    from analysis.identify import Measurement, select
+    from analysis.identify import Measurement
 
     check_excited_band(record, band_hz)
-    band_hz = record_band_hz(record, band_hz)
-    selection = select(
-        Measurement.from_record(record), fixed_settings=fixed_parameters, band_hz=band_hz
-    )
-    return WholeRecord(record, selection, band_hz, fixed_parameters)
+    return Measurement.from_record(record), record_band_hz(record, band_hz)
 
 
 def record_result(
@@ -344,6 +394,7 @@ def record_result(
     on_step: Callable[[str], None] = lambda _step_text: None,
     warn: Callable[[str], None] = lambda _warning_text: None,
     on_welch: Callable[[WelchAnalysis], None] = lambda _welch_analysis: None,
+    on_whole: Callable[[WholeRecord], None] = lambda _whole_fits: None,
 ) -> RecordResult:
     """Run the selected analyses of a session file.
 
@@ -359,6 +410,9 @@ def record_result(
         Called with a sentence on each omitted analysis.
     on_welch : callable, optional
         Called with the Welch fits while another process fits the whole record.
+    on_whole : callable, optional
+        Called with the fits to the whole record while another process makes the Welch fits, which
+        take longer if the former are stored in the user's cache.
 
     Raises
     ------
@@ -390,25 +444,37 @@ def record_result(
         for warning_text in warning_texts:
             warn(warning_text)
         return RecordResult(record, whole_fits)
-    fit_welch = partial(
-        welch_analysis, record, options.settings, options.band_hz, is_optional=options.whole_record
+    fit_welch = cache(
+        partial(
+            welch_analysis,
+            record,
+            options.settings,
+            options.band_hz,
+            is_optional=options.whole_record,
+        )
     )
     if not options.whole_record:
         on_step("Welch fits")
         return RecordResult(record, None, fit_welch()[0])
     on_step("Welch fits and whole record")
-    # Chosen settings may not suit the record, which is reported at once.
-    welch_outcome = None if options.settings.are_from_paper else fit_welch()
+    if not options.settings.are_from_paper:
+        fit_welch()  # chosen settings may not suit the record, which is reported at once
     measurement_error = None
-    fit_whole = partial(_fit_whole_record, record, options)
-    with computed_in_parallel(fit_whole) as whole_fits_with_warnings:
-        welch_results, omission_remark = welch_outcome or fit_welch()
-        if welch_results is not None:
-            on_welch(welch_results)
-        try:
-            whole_fits, warning_texts = whole_fits_with_warnings()
-        except MeasurementError as error:
-            measurement_error = error
+    if (stored_fits := _stored_fits(record, options)) is not None:
+        with computed_in_parallel(fit_welch) as welch_fits:
+            whole_fits = _add_structure_fits(stored_fits, options.structures, warning_texts.append)
+            on_whole(whole_fits)
+            welch_results, omission_remark = welch_fits()
+    else:
+        fit_whole = partial(_fit_whole_record, record, options)
+        with computed_in_parallel(fit_whole) as whole_fits_with_warnings:
+            welch_results, omission_remark = fit_welch()
+            if welch_results is not None:
+                on_welch(welch_results)
+            try:
+                whole_fits, warning_texts = whole_fits_with_warnings()
+            except MeasurementError as error:
+                measurement_error = error
     for warning_text in warning_texts:
         warn(warning_text)
     if omission_remark is not None:
@@ -423,6 +489,16 @@ def record_result(
         None if whole_fits is None else replace(whole_fits, record=record),
         None if welch_results is None else replace(welch_results, record=record),
     )
+
+
+def _stored_fits(record: Record, options: AnalysisOptions) -> WholeRecord | None:
+    """Return the fits to a whole record if they are stored; None also if it cannot be used."""
+    from analysis.identify import MeasurementError
+
+    try:
+        return stored_whole_record(record, options.fixed_parameters, options.band_hz)
+    except MeasurementError:
+        return None  # the fits raise this error, after the Welch fits
 
 
 def _fit_whole_record(record: Record, options: AnalysisOptions) -> tuple[WholeRecord, list[str]]:

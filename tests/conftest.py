@@ -53,6 +53,9 @@ _RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
 # Nor a profile of the user's own that hides a shipped one.
 os.environ["XDG_CONFIG_HOME"] = f"{_RUNTIME}/config"
+# Nor fits of an earlier run: records are fitted anew, except where the cache is tested.
+os.environ["XDG_CACHE_HOME"] = f"{_RUNTIME}/cache"
+os.environ["RIGD_NO_CACHE"] = "1"
 # Sessions make no quick look, except where that is tested.
 os.environ["RIGD_NO_LOOK"] = "1"
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)

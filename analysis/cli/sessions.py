@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from analysis.paper.welch_analysis import WelchAnalysis
-    from analysis.results import AnalysisOptions, ImagesByName, RecordResult
+    from analysis.results import AnalysisOptions, ImagesByName, RecordResult, WholeRecord
 
 _TEXT_WIDTH_CHARACTERS: Final = 120
 """Width in characters of texts that are printed to a file or a pipe."""
@@ -169,13 +169,14 @@ def session_command(
     OutputExistsError, OutputError
         An output file cannot be written.
     """
-    from analysis.report import document, document_text
     from analysis.report.folder import report_folders, write_new_file
 
     folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
     record_results, errors, exit_code = _analyse_all(files, folders, options, rerun, outputs)
     if not record_results:
         return exit_code
+    from analysis.report import document, document_text
+
     results_document = document(record_results, {**(other_errors or {}), **errors})
     if outputs.json is not None and not outputs.json_to_stdout:
         # The file is written before any output, because the streams may be closed.
@@ -317,14 +318,13 @@ def _error_message(session_file: Path, error: Exception) -> str:
 
 def _count_steps(options: AnalysisOptions, rerun_file: Path | None) -> int:
     """Return the number of progress steps of the analysis of one file."""
-    from analysis.report import FIGURES as RECORD_FIGURES
-    from analysis.report.record_report import welch_figure_names
+    from analysis.report.figure_names import FIGURES, welch_figure_names
 
     figure_names = welch_figure_names(
         with_paper_figures=options.with_welch_fits, has_whole_record=options.whole_record
     )
     figure_count = (
-        len(figure_names) + options.whole_record * len(RECORD_FIGURES) + (rerun_file is not None)
+        len(figure_names) + options.whole_record * len(FIGURES) + (rerun_file is not None)
     )
     return 2 + _STEPS_PER_FIGURE * figure_count  # reading, and all fits
 
@@ -341,24 +341,34 @@ def _analyse_file(
 ) -> RecordResult:
     """Analyse one file, and write its report and its file for Rerun."""
     from analysis.report.folder import new_report_folder
-    from analysis.report.record_report import draw_welch_figures, write_report
     from analysis.results import record_result
 
-    welch_images: ImagesByName = {}
+    # The report, which imports matplotlib, is imported where it is used first: another process
+    # fits the record meanwhile.
+    drawn_images: ImagesByName = {}
 
     def draw_welch(analysis: WelchAnalysis) -> None:
-        welch_images.update(draw_welch_figures(analysis, options.figures, on_step))
+        from analysis.report.record_report import draw_welch_figures
+
+        drawn_images.update(draw_welch_figures(analysis, options.figures, on_step))
+
+    def draw_whole(whole_record: WholeRecord) -> None:
+        from analysis.report.record_report import draw_first_figures
+
+        drawn_images.update(draw_first_figures(whole_record, options.figures, on_step))
 
     file_result = record_result(
-        session_file, options, on_step=on_step, warn=warn, on_welch=draw_welch
+        session_file, options, on_step=on_step, warn=warn, on_welch=draw_welch, on_whole=draw_whole
     )
+    from analysis.report.record_report import write_report
+
     with new_report_folder(report_folder, overwrite=overwrite) as partial_folder:
         write_report(
             file_result,
             partial_folder,
             on_step,
             formats=options.figures,
-            welch_images=welch_images,
+            drawn_images=drawn_images,
         )
     if rerun_file is not None:
         from analysis.report import write_rerun_file

@@ -1,5 +1,6 @@
 from . import bands as bands
 from . import campaign_report as campaign_report
+from . import figure_names as figure_names
 from . import folder as folder
 from . import record_report as record_report
 from . import table as table
@@ -8,7 +9,6 @@ from ._campaign_document import campaign_document as campaign_document
 from ._document import document as document
 from ._document import document_text as document_text
 from ._frf_figure import frf_figure as frf_figure
-from ._record_figures import FIGURES as FIGURES
 from ._record_figures import illustrations as illustrations
 from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
@@ -19,3 +19,4 @@ from ._text import result_text as result_text
 from ._text import shown_warnings as shown_warnings
 from ._text import summary_table as summary_table
 from ._text import warning_lines as warning_lines
+from .figure_names import FIGURES as FIGURES

@@ -23,8 +23,9 @@ from analysis.decimation import fast_fft_length
 from analysis.report import _style as style
 from analysis.report._shown_model import ShownModel
 from analysis.report._style import Illustration
-from analysis.report._uniformity import UNIFORMITY_FIGURE, uniformity_description, uniformity_figure
+from analysis.report._uniformity import uniformity_description, uniformity_figure
 from analysis.report.bands import dense_grid, loss_estimate, loss_factors, supported_band_hz
+from analysis.report.figure_names import FIGURES, UNIFORMITY_FIGURE
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response, magnitude_db, phase_deg
@@ -513,12 +514,6 @@ def residual_power(
         interval_count * bin_spacing_hz
     )
     return times_s, interval_power
-
-
-FIGURES: Final = ("record_frf", UNIFORMITY_FIGURE, "loss_factor", "residual", "record_signals")
-"""File names of a whole record's figures.
-
-The second figure is omitted if too few modes are visible for the test."""
 
 
 def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.report.table import Entry
 
-UNIFORMITY_FIGURE: Final = "uniform_beam"
-"""Name of the file with the figure of the test, without suffix."""
-
 _MODAL_CONSTANT_TITLES: Final = {
     "ln_frequency": "Frequency",
     "ln_damping_ratio": "Damping ratio",

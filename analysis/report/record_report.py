@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import ESTIMATOR_NAMES
@@ -13,7 +14,8 @@ from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
 from analysis.report._text import damping_sentences, tables_text
-from analysis.report._uniformity import UNIFORMITY_FIGURE, uniformity_table
+from analysis.report._uniformity import uniformity_table
+from analysis.report.figure_names import UNIFORMITY_FIGURE, WELCH_FIGURES, welch_figure_names
 from analysis.report.folder import sha256, write_new_file
 from analysis.report.table import Table, csv_text, latex_table, with_validity
 from analysis.results import DEFAULT_FORMATS
@@ -328,12 +330,8 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
     return tables.modes_table(whole_record), record_tables, paper_tables
 
 
-_WELCH_FIGURES: Final = ("welch_signals", "welch_frf", "welch_torque")
-"""Names of the Welch fits' figures."""
-_WELCH_FIGURES_WITH_RECORD: Final = ("welch_frf",)
-"""Names of the Welch fits' figures in a report with whole-record fits.
-
-The whole-record fits have their own figures of signals and torque."""
+_FIRST_FIGURES: Final = 2
+"""Number of a whole record's figures that are drawn while another process makes the Welch fits."""
 
 
 def write_report(
@@ -341,7 +339,7 @@ def write_report(
     folder: Path,
     on_step: Callable[[str], None] = lambda _step_text: None,
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
-    welch_images: ImagesByName | None = None,
+    drawn_images: ImagesByName | None = None,
 ) -> None:
     """Write the report of a record into a folder.
 
@@ -359,8 +357,8 @@ def write_report(
         Function that is called after each figure with a short text.
     formats : sequence of str
         Formats of the figures.
-    welch_images : mapping, optional
-        Figures that `draw_welch_figures` has drawn already.
+    drawn_images : mapping, optional
+        Figures that `draw_welch_figures` or `draw_first_figures` has drawn already.
 
     Raises
     ------
@@ -380,7 +378,7 @@ def write_report(
         from analysis.report._record_figures import illustrations as record_illustrations
 
         illustrations = [*paper_illustrations, *record_illustrations(whole_record)]
-    pictures = save_pictures(illustrations, folder / "figures", formats, on_step, welch_images)
+    pictures = save_pictures(illustrations, folder / "figures", formats, on_step, drawn_images)
     write_new_file(folder / "tables.txt", tables_text(result))
     if whole_record is not None:
         paper_figure_count = len(paper_illustrations)
@@ -426,19 +424,31 @@ def draw_welch_figures(
     return welch_images
 
 
-def welch_figure_names(*, with_paper_figures: bool, has_whole_record: bool) -> tuple[str, ...]:
-    """Return the names of the Welch fits' figures in a report.
+def draw_first_figures(
+    whole_record: WholeRecord,
+    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
+    on_step: Callable[[str], None] = lambda _step_text: None,
+) -> ImagesByName:
+    """Draw the first figures of a whole record in the time that the Welch fits take.
 
     Parameters
     ----------
-    with_paper_figures : bool
-        Whether the Welch fits were run.
-    has_whole_record : bool
-        Whether the whole-record fits were run.
+    whole_record : WholeRecord
+        Fits to the whole record.
+    formats : sequence of str
+        Formats of the figures.
+    on_step : callable, optional
+        Function that is called after each figure with a short text.
+
+    Returns
+    -------
+    dict
+        Image files by the figure's name and the format.
     """
-    if not with_paper_figures:
-        return ()
-    return _WELCH_FIGURES_WITH_RECORD if has_whole_record else _WELCH_FIGURES
+    from analysis.report._record_figures import illustrations
+    from analysis.report._style import draw_images
+
+    return draw_images(islice(illustrations(whole_record), _FIRST_FIGURES), formats, on_step)
 
 
 def _welch_illustrations(
@@ -450,7 +460,7 @@ def _welch_illustrations(
     from analysis.report._style import Illustration
 
     drawing_functions = dict(
-        zip(_WELCH_FIGURES, (paper_signals_figure, frf_figure, torque_figure), strict=True)
+        zip(WELCH_FIGURES, (paper_signals_figure, frf_figure, torque_figure), strict=True)
     )
     for name in welch_figure_names(with_paper_figures=True, has_whole_record=has_whole_record):
         yield Illustration(name, partial(drawing_functions[name], analysis), _WELCH_DESCRIPTION)

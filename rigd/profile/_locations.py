@@ -1,11 +1,12 @@
 """Search for profile and specimen files: working folder, user's own folder, shipped files."""
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Final
+
+from rigd.runtime.user_folders import config_folder
 
 WORKING_FOLDER: Final = Path("hw_profiles")
 """Folder of profiles, relative to the working folder."""
@@ -80,13 +81,8 @@ def user_folder() -> Path | None:
 
     The folder need not exist.
     """
-    config_folder = Path(os.environ.get("XDG_CONFIG_HOME", ""))
-    if not config_folder.is_absolute():  # the XDG specification ignores relative paths
-        try:
-            config_folder = Path.home() / ".config"
-        except RuntimeError:  # for example in a container, with an unknown user id
-            return None
-    return config_folder / "rigd" / "profiles"
+    folder = config_folder()
+    return None if folder is None else folder / "profiles"
 
 
 def _search_folders() -> Iterator[tuple[ProfileOrigin, Path]]:

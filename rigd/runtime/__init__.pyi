@@ -3,6 +3,7 @@ from . import background as background
 from . import computations as computations
 from . import locks as locks
 from . import processes as processes
+from . import user_folders as user_folders
 from ._plain_files import open_plain_file as open_plain_file
 from ._plain_files import read_plain_file as read_plain_file
 from ._session_signals import STOP_SIGNAL as STOP_SIGNAL

@@ -19,6 +19,19 @@ class ComputationError(Exception):
     """Raised if the copy of the process has ended without a value."""
 
 
+def _read_only_mapping(items: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    """Return a read-only mapping; a pickle refers to this function, as it cannot to the type."""
+    return MappingProxyType(items)
+
+
+class ValuePickler(pickle.Pickler):
+    """Pickler that can also pickle read-only mappings."""
+
+    dispatch_table = copyreg.dispatch_table | {
+        MappingProxyType: lambda mapping: (_read_only_mapping, (dict(mapping),))
+    }
+
+
 class ForkedComputation(Generic[ValueT]):
     """Computation that has been started in a copy of this process (fork).
 
@@ -43,11 +56,7 @@ class ForkedComputation(Generic[ValueT]):
         if self._process_id == 0:
             has_failed = True
             with suppress(BaseException):
-                pickler = pickle.Pickler(self._value_file, protocol=5)
-                pickler.dispatch_table = copyreg.dispatch_table | {
-                    MappingProxyType: lambda mapping: (_read_only_mapping, (dict(mapping),))
-                }
-                pickler.dump(compute())
+                ValuePickler(self._value_file, protocol=5).dump(compute())
                 self._value_file.flush()
                 has_failed = False
             os._exit(has_failed)
@@ -89,11 +98,6 @@ class ForkedComputation(Generic[ValueT]):
             if process_id:
                 self._exit_status = exit_status
         return self._exit_status is not None
-
-
-def _read_only_mapping(items: dict[Any, Any]) -> MappingProxyType[Any, Any]:
-    """Return a read-only mapping; a pickle refers to this function, as it cannot to the type."""
-    return MappingProxyType(items)
 
 
 @contextmanager
