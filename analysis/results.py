@@ -320,7 +320,7 @@ def whole_record(
     """Fit every damping structure to a whole record, and select the best supported one.
 
     The fits are stored in the user's cache, and read there if they were computed before (see
-    `analysis.fit_cache`).
+    `analysis.identify.fit_cache`).
 
     Parameters
     ----------
@@ -336,8 +336,8 @@ def whole_record(
     MeasurementError
         The record cannot be used, or not in this band.
     """
-    from analysis.fit_cache import FitCache
     from analysis.identify import select
+    from analysis.identify.fit_cache import FitCache
 
     if (stored_fits := stored_whole_record(record, fixed_parameters, band_hz)) is not None:
         return stored_fits
@@ -365,7 +365,7 @@ def stored_whole_record(
     MeasurementError
         The record cannot be used, or not in this band.
     """
-    from analysis.fit_cache import FitCache
+    from analysis.identify.fit_cache import FitCache
 
     measurement, band_hz = _fitted_measurement(record, band_hz)
     if (fit_cache := FitCache.of_user()) is None:

@@ -318,7 +318,7 @@ def _error_message(session_file: Path, error: Exception) -> str:
 
 def _count_steps(options: AnalysisOptions, rerun_file: Path | None) -> int:
     """Return the number of progress steps of the analysis of one file."""
-    from analysis.report.figure_names import FIGURES, welch_figure_names
+    from analysis.report.folder import FIGURES, welch_figure_names
 
     figure_names = welch_figure_names(
         with_paper_figures=options.with_welch_fits, has_whole_record=options.whole_record

@@ -1,6 +1,7 @@
 from . import beam_uniformity as beam_uniformity
 from . import deviance_curve as deviance_curve
 from . import drag_torque as drag_torque
+from . import fit_cache as fit_cache
 from . import free_decay as free_decay
 from . import headline as headline
 from . import modal_headline as modal_headline

@@ -1,6 +1,5 @@
 from . import bands as bands
 from . import campaign_report as campaign_report
-from . import figure_names as figure_names
 from . import folder as folder
 from . import record_report as record_report
 from . import table as table
@@ -19,4 +18,4 @@ from ._text import result_text as result_text
 from ._text import shown_warnings as shown_warnings
 from ._text import summary_table as summary_table
 from ._text import warning_lines as warning_lines
-from .figure_names import FIGURES as FIGURES
+from .folder import FIGURES as FIGURES

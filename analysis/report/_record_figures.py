@@ -25,7 +25,7 @@ from analysis.report._shown_model import ShownModel
 from analysis.report._style import Illustration
 from analysis.report._uniformity import uniformity_description, uniformity_figure
 from analysis.report.bands import dense_grid, loss_estimate, loss_factors, supported_band_hz
-from analysis.report.figure_names import FIGURES, UNIFORMITY_FIGURE
+from analysis.report.folder import FIGURES, UNIFORMITY_FIGURE
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response, magnitude_db, phase_deg

@@ -24,6 +24,19 @@ _MAX_CHECKSUM_LIST_BYTES: Final = 10_000_000
 CHECKSUM_LIST_NAME: Final = "SHA256SUMS"
 """Name of the file that lists a report's files with their checksums."""
 
+UNIFORMITY_FIGURE: Final = "uniform_beam"
+"""Name of the file with the figure of the test of the beam's uniformity, without suffix."""
+FIGURES: Final = ("record_frf", UNIFORMITY_FIGURE, "loss_factor", "residual", "record_signals")
+"""File names of a whole record's figures.
+
+The second figure is omitted if too few modes are visible for the test."""
+WELCH_FIGURES: Final = ("welch_signals", "welch_frf", "welch_torque")
+"""Names of the Welch fits' figures."""
+_WELCH_FIGURES_WITH_RECORD: Final = ("welch_frf",)
+"""Names of the Welch fits' figures in a report with whole-record fits.
+
+The whole-record fits have their own figures of signals and torque."""
+
 _RESULT_KEYS: Final = frozenset(("versions", "headlines", "fits"))
 """Keys by which a JSON document is recognised as results of an analysis."""
 
@@ -37,6 +50,21 @@ class OutputError(Exception):
 
 
 # Names
+
+
+def welch_figure_names(*, with_paper_figures: bool, has_whole_record: bool) -> tuple[str, ...]:
+    """Return the names of the Welch fits' figures in a report.
+
+    Parameters
+    ----------
+    with_paper_figures : bool
+        Whether the Welch fits were run.
+    has_whole_record : bool
+        Whether the whole-record fits were run.
+    """
+    if not with_paper_figures:
+        return ()
+    return _WELCH_FIGURES_WITH_RECORD if has_whole_record else WELCH_FIGURES
 
 
 def report_folders(

@@ -15,8 +15,13 @@ from analysis.report._document import document, document_text
 from analysis.report._equation import definitions, equations, latex, mathml, types_table
 from analysis.report._text import damping_sentences, tables_text
 from analysis.report._uniformity import uniformity_table
-from analysis.report.figure_names import UNIFORMITY_FIGURE, WELCH_FIGURES, welch_figure_names
-from analysis.report.folder import sha256, write_new_file
+from analysis.report.folder import (
+    UNIFORMITY_FIGURE,
+    WELCH_FIGURES,
+    sha256,
+    welch_figure_names,
+    write_new_file,
+)
 from analysis.report.table import Table, csv_text, latex_table, with_validity
 from analysis.results import DEFAULT_FORMATS
 from rigd.spectral import WINDOW

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import analysis.identify
-from analysis import fit_cache
-from analysis.fit_cache import FitCache
-from analysis.identify import Measurement, select
+from analysis.identify import Measurement, fit_cache, select
+from analysis.identify.fit_cache import FitCache
 from analysis.models import WelchSettings
 from analysis.record import load_record
 from analysis.results import AnalysisOptions, record_result, whole_record

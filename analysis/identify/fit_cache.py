@@ -187,7 +187,7 @@ def _programs_digest() -> bytes:
 def _source_digest() -> bytes:
     """Return a digest of the source code of this project's packages."""
     digest = blake2b(digest_size=16)
-    source_folder = Path(__file__).resolve().parents[1]
+    source_folder = Path(__file__).resolve().parents[2]
     for program in _PROGRAMS:
         for path in sorted((source_folder / program).rglob("*.py")):
             digest.update(os.fsencode(path.relative_to(source_folder)) + b"\0")
