@@ -90,14 +90,17 @@ class RecordSource:
 
 
 def blocks_of_session(path: Path, block_s: float = BLOCK_S) -> tuple[RecordSource, ...]:
-    """Divide a session into consecutive blocks of equal length; the last one may differ by half.
+    """Divide a session into consecutive blocks of equal length, each with some of the excitation.
+
+    The first block also contains the rest before the excitation, and the last one the ring-down
+    after it, and up to half a block more or less of the excitation.
 
     Parameters
     ----------
     path : Path
         Session file.
     block_s : float
-        Length of the blocks in seconds. A remainder of less than half belongs to the last one.
+        Length of the blocks in seconds.
 
     Raises
     ------
@@ -130,14 +133,23 @@ def blocks_of_session(path: Path, block_s: float = BLOCK_S) -> tuple[RecordSourc
         beginning = read_ticks()
     rate_hz, first_tick = stated_rate_hz(beginning), int(beginning.samples["tick"][:1].sum())
     check_part_length(path, (0.0, block_s), stated_beam(beginning, rate_hz, summary.samples))
-    first_s, duration_s = first_tick / rate_hz, summary.samples / rate_hz
-    block_count = math.floor(duration_s / block_s + 0.5)
-    if block_count < 2:
-        raise RecordError(
-            f"{path}: {duration_s:g} s are too short for two blocks of {block_s:g} s; choose a "
-            "shorter --block."
+    first_s, end_s = first_tick / rate_hz, (first_tick + summary.samples) / rate_hz
+    excited_ticks = beginning.segments.get("sweep", (0, math.inf))
+    excited_from_s, excited_to_s = (
+        min(max(tick / rate_hz, first_s), end_s) for tick in excited_ticks
+    )
+    limits_s = [
+        first_s + block_s * number
+        for number in range(
+            math.ceil((excited_from_s - first_s) / block_s + 0.5),
+            math.floor((excited_to_s - first_s) / block_s - 0.5) + 1,
         )
-    limits_s = [first_s + block_s * number for number in range(1, block_count)]
+    ]
+    if not limits_s:
+        raise RecordError(
+            f"{path}: {excited_to_s - excited_from_s:g} s of excitation are too short for two "
+            f"blocks of {block_s:g} s; choose a shorter --block."
+        )
     return tuple(
         RecordSource(path, part_s)
         for part_s in zip([None, *limits_s], [*limits_s, None], strict=True)

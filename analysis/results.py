@@ -8,6 +8,7 @@ each result (`analysis.campaigns.SessionAnalysis`) and combines these in an
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -426,6 +427,7 @@ def record_result(
         check_record_band,
         highest_frequency_hz,
         welch_analysis,
+        welch_exclusion_reason,
     )
     from analysis.identify import MeasurementError
     from analysis.record import load_record
@@ -467,7 +469,13 @@ def record_result(
             welch_results, omission_remark = welch_fits()
     else:
         fit_whole = partial(_fit_whole_record, record, options)
-        with computed_in_parallel(fit_whole) as whole_fits_with_warnings:
+        are_omitted = options.settings.are_from_paper and welch_exclusion_reason(
+            record, options.band_hz
+        )
+        # Another process takes memory, and this one would only wait for it without Welch fits.
+        with (
+            nullcontext(fit_whole) if are_omitted else computed_in_parallel(fit_whole)
+        ) as whole_fits_with_warnings:
             welch_results, omission_remark = fit_welch()
             if welch_results is not None:
                 on_welch(welch_results)

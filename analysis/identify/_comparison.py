@@ -300,6 +300,10 @@ class Comparison:
         """
         return np.fft.rfft(time_series)[..., self.band_bins]
 
+    def band_spectrum(self, time_series: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Transform time series of all samples to spectra in the band, as `spectrum` does."""
+        return self.spectrum(time_series[..., self.retained_samples])
+
     def to_time_series(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Transform a spectrum in the band, shape (K,), to the time series of retained samples.
 
@@ -533,10 +537,6 @@ class Comparison:
         """
         drag_response = self.drag_response(plant, measured_modes)
         drag_torque = drag_response.torque(law, range(1, self.visible_mode_count + 1))
-
-        def band_spectrum(time_series: NDArray[np.float64]) -> NDArray[np.complex128]:
-            return self.spectrum(time_series[..., self.retained_samples])
-
         unknown_torque_indices = self._decimated_indices(~self.measurement.torque_known)
         full_rate_drag_torque_nm = np.fft.irfft(
             self.decimation.downsampling_factor * np.fft.rfft(drag_torque.torque_nm),
@@ -552,17 +552,17 @@ class Comparison:
                 plant=plant,
                 law=law,
                 response=drag_response,
-                band_spectrum=band_spectrum,
+                band_spectrum=self.band_spectrum,
                 pole_derivatives={
-                    mode_number: band_spectrum(derivative_rows)
+                    mode_number: self.band_spectrum(derivative_rows)
                     for mode_number, derivative_rows in drag_torque.pole_derivatives.items()
                 },
-                external_damping_derivatives=band_spectrum(
+                external_damping_derivatives=self.band_spectrum(
                     drag_torque.external_damping_derivatives
                 ),
-                ln_density_derivative=band_spectrum(drag_torque.ln_density_derivative),
-                delay_derivative=band_spectrum(drag_torque.delay_derivative),
-                law_derivatives=band_spectrum(drag_torque.law_derivatives),
+                ln_density_derivative=self.band_spectrum(drag_torque.ln_density_derivative),
+                delay_derivative=self.band_spectrum(drag_torque.delay_derivative),
+                law_derivatives=self.band_spectrum(drag_torque.law_derivatives),
                 mean_speed_m_s=drag_torque.mean_speed_m_s,
                 top_speed_m_s=drag_torque.top_speed_m_s,
             ),

@@ -108,7 +108,9 @@ class FitCache:
         fixed_settings: Iterable[Setting],
         band_hz: tuple[float, float],
     ) -> None:
-        """Store the selection of a record; do nothing if it cannot be written.
+        """Store the selection of a record; do nothing if that is not possible.
+
+        It is not if the folder cannot be written, or if the selection cannot be pickled.
 
         Parameters
         ----------
@@ -118,7 +120,7 @@ class FitCache:
             Its arguments.
         """
         path = self._entry_path(measurement, fixed_settings, band_hz)
-        with suppress(OSError):
+        with suppress(OSError, pickle.PicklingError, AttributeError, TypeError):
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             # A name of its own until the entry is complete: others may write the same entry.
             with tempfile.NamedTemporaryFile(dir=self._folder, delete=False) as file:

@@ -113,8 +113,21 @@ def test_blocks_cover_the_session(steady):
     ]  # fmt: skip
 
 
+def test_every_block_has_some_of_the_excitation(write_session, tmp_path):
+    """Rest and ring-down may last longer than a block."""
+    angle_rad = np.zeros(40 * 250)
+    signals = Signals(
+        angle_rad, angle_rad, angle_rad, {"rest": (0, 12 * 250), "sweep": (12 * 250, 26 * 250)},
+        RATE_HZ, {"excitation": "multisine", "beam_length_m": "0.3"},
+    )  # fmt: skip
+    blocks = blocks_of_session(write_session(tmp_path / "a.mcap", signals), 5.0)
+    assert [block.part_s for block in blocks] == [(None, 15.0), (15.0, 20.0), (20.0, None)]
+
+
 def test_sessions_that_cannot_be_divided(steady, paper_file, short_signals, tmp_path):
-    with pytest.raises(RecordError, match=r"200 s are too short for two blocks of 150 s"):
+    with pytest.raises(
+        RecordError, match="199 s of excitation are too short for two blocks of 150"
+    ):
         blocks_of_session(steady, 150.0)
     with pytest.raises(RecordError, match=r"blocks of one sweep .* --repeat"):
         blocks_of_session(paper_file, 30.0)
