@@ -67,7 +67,8 @@ square: this amplitude together with the largest one distinguishes them best (G.
 allocation in linear regression theory, Ann. Math. Stat. 23, 1952)."""
 _SEGMENTS_PER_FULL_AMPLITUDE: Final = 4
 """While air drag is unknown, one of this number of segments has the largest amplitude; the optimum
-would be 29 % of the time."""
+would be 29 % of the time. Segments that only wait until the vibration has decayed to the reduced
+amplitude are not counted: mode 1 takes some seconds for that."""
 _CORRECTION_FACTOR_RANGE: Final = (0.5, 16.0)
 """Range to which the factor that corrects the design is limited: the ratio of the reported standard
 deviation to the predicted one."""
@@ -231,7 +232,7 @@ class ExcitationPlanner:
         self._max_ticks = reference_writer.ticks + reference_writer.room
         scan_tick, scan_rad = search.scan
         self._intervals = [_PlannedInterval("scan", scan_rad, scan_tick, scan_tick)]
-        self._segment_count = self._repeated_scans = self._shown_tick = 0
+        self._segment_count = self._driven_count = self._repeated_scans = self._shown_tick = 0
         self._excites_unseen_modes = self._has_full_fit = False
         self._unreachable_count = self._doubtful_count = 0
         self._tightening = 1.0
@@ -422,6 +423,7 @@ class ExcitationPlanner:
             yield self._search_end_message(f"Out of reach: {unreachable_reason}", is_reached=False)
             return
         self._segment_count += 1
+        self._driven_count += bool(np.any(next_planned_segment.reference_rad))
         self._append_segment(f"piece_{self._segment_count}", next_planned_segment.reference_rad)
         self.due_tick = self._intervals[-1].first_reference_tick
         # Another structure, such as a compliant clamp, may fit where a uniform beam does not.
@@ -433,7 +435,7 @@ class ExcitationPlanner:
     def _next_amplitude_fraction(self, *, with_air_drag: bool) -> float:
         """Return the amplitude of the next segment, relative to the largest one."""
         has_full_amplitude = (
-            not with_air_drag or self._segment_count % _SEGMENTS_PER_FULL_AMPLITUDE == 0
+            not with_air_drag or self._driven_count % _SEGMENTS_PER_FULL_AMPLITUDE == 0
         )
         return 1.0 if has_full_amplitude else _REDUCED_AMPLITUDE_FRACTION
 

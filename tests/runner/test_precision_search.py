@@ -66,11 +66,16 @@ def test_a_search_may_state_the_uniformity_of_the_beam():
             uniformity_percent(uniformity_percent=wrong)
 
 
-def use_rest_segments(monkeypatch, std):
-    """Replace the slow design by segments of a second of rest; return the options of each call."""
-    rest, planned = np.zeros(RATE_HZ), []
+def use_rest_segments(monkeypatch, std, driven=()):
+    """Replace the slow design by segments of a second of rest; return the options of each call.
+
+    The first segments are given: those for which `driven` is True move the motor.
+    """
+    planned = []
 
     def design(estimate, angle_rad, targets, rig, time_left_s, **options):
+        is_driven = len(planned) < len(driven) and driven[len(planned)]
+        rest = (1e-3 if is_driven else 0.0) * np.sin(np.linspace(0, np.pi, RATE_HZ)) ** 4
         planned.append({"targets": targets, **options})
         k = len(estimate.free_parameters)
         now = (Precision(targets[0], 1.0, std, 0.1),)
@@ -123,13 +128,23 @@ def test_next_segment_follows_an_uncertain_estimate(bench):
 
 
 def test_two_amplitudes_distinguish_air_drag_from_damping(bench, monkeypatch):
-    planned = use_rest_segments(monkeypatch, std=1.0)
+    planned = use_rest_segments(monkeypatch, std=1.0, driven=10 * [True])
     for with_air_drag in (False, False, *8 * (True,)):
         bench.plan(ON_THE_WAY, with_air_drag=with_air_drag)
     fractions = [options["limit_fraction"] for options in planned]
     reduced = fractions[3]
     assert 0.3 < reduced < 0.5
     assert fractions == [1.0, 1.0, *2 * (reduced, reduced, 1.0, reduced)]
+
+
+def test_waiting_for_a_decay_is_no_segment_of_reduced_amplitude(bench, monkeypatch):
+    """Else the vibration would never fall to the reduced amplitude."""
+    driven = [True, False, False, False, False, True, False, True, True, True]
+    planned = use_rest_segments(monkeypatch, std=1.0, driven=driven)
+    for _ in driven:
+        bench.plan(ON_THE_WAY, with_air_drag=True)
+    fractions = [options["limit_fraction"] for options in planned]
+    assert [fraction == 1.0 for fraction in fractions] == [True, *8 * [False], True]
 
 
 def test_ratio_of_a_value_below_its_uncertainty(profile):
