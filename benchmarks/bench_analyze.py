@@ -137,7 +137,7 @@ def main() -> None:
     use_one_thread()  # as the command does
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        os.environ |= {"RIGD_NO_CACHE": "1", "XDG_CACHE_HOME": str(folder / "cache")}
+        os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
         if gate.given.session:  # a copy: the quick look is written next to it
             session = Path(shutil.copy(gate.given.session, folder))
         else:

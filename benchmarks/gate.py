@@ -17,12 +17,16 @@ benchmark needs, it ends with exit code 3 and the reason, which is no error of `
 import argparse
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
+
+# Every analysis fits its records: a benchmark measures no stored fits of an earlier one.
+os.environ["RIGD_NO_CACHE"] = "1"
 
 EXIT_CODE_OF_IMPOSSIBLE = 3
 """Exit code of a benchmark that this computer cannot run."""
