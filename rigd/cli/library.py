@@ -351,7 +351,8 @@ def info(
     has_failed = False
     for file_number, file_path in enumerate(paths):
         try:
-            description = describe(file_path)
+            with task_progress(file_path.name) as on_progress:
+                description = describe(file_path, on_progress)
         except SessionError as error:
             has_failed = True
             print_error(str(error))

@@ -1,7 +1,7 @@
 """Summary of a session file for `rigd info`, as lines of text and as JSON."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -161,8 +161,15 @@ class SessionInfo:
         ]
 
 
-def describe(path: str | PathLike[str]) -> SessionInfo:
+def describe(
+    path: str | PathLike[str], on_progress: Callable[[float], None] | None = None
+) -> SessionInfo:
     """Return a summary of a session file.
+
+    Parameters
+    ----------
+    path : path of a complete file
+    on_progress : called repeatedly with the completed fraction of the work, from 0 to 1
 
     Raises
     ------
@@ -178,7 +185,10 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     """
     path = Path(path)
     session = read_session(
-        path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_RECORDED_SAMPLES
+        path,
+        fields=ORDER_AND_FLAG_FIELDS,
+        max_samples=limits.MAX_RECORDED_SAMPLES,
+        on_progress=on_progress,
     )
     rate_hz = session.number("rate_hz")
     if rate_hz <= 0:

@@ -137,6 +137,7 @@ def read_session(
     max_samples: int = limits.MAX_SAMPLES,
     on_samples: Callable[[npt.NDArray[np.void]], None] | None = None,
     part_s: tuple[float, float] | None = None,
+    on_progress: Callable[[float], None] | None = None,
 ) -> Session:
     """Read a complete session file: samples, metadata, log and attachments.
 
@@ -150,6 +151,7 @@ def read_session(
     part_s : beginning and end of a part, in s since the session's start. Chunks of samples before
         or after it, except those of the segment ``rest``, are neither read nor checked; the samples
         near its ends may be outside the part. By default, all samples are read.
+    on_progress : called repeatedly with the completed fraction of the work, from 0 to 1
 
     Raises
     ------
@@ -192,6 +194,7 @@ def read_session(
         (SAMPLE_TOPIC, EVENT_TOPIC),
         add_block,
         None if part_s is None else _ChunksOfPart(part_s),
+        on_progress,
     )
     metadata = merged_metadata(mcap_contents, "session") or {}
     format_version = metadata.get("format_version", FORMAT_VERSION)
@@ -477,9 +480,12 @@ def _load_intact_contents(
     topics: Sequence[str],
     on_block: OnBlock,
     is_chunk_needed: IsChunkNeeded | None = None,
+    on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
     """Return the contents of a session file; raise if it is incomplete or damaged."""
-    contents = load_contents(path, topics, on_block=on_block, is_chunk_needed=is_chunk_needed)
+    contents = load_contents(
+        path, topics, on_block=on_block, on_progress=on_progress, is_chunk_needed=is_chunk_needed
+    )
     if contents.damage is not None:
         raise SessionError(_damage_message(path, contents))
     if SAMPLE_TOPIC not in {channel.topic for channel in contents.channels.values()}:

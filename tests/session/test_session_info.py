@@ -147,3 +147,10 @@ def test_several_files_are_described_in_turn(gappy, rigd_here, tmp_path):
     assert second["path"] == "missing.mcap"
     done = rigd_here("info", "--json", gappy)
     assert (done.returncode, json.loads(done.stdout)) == (0, first)
+
+
+def test_progress_increases_while_a_file_is_read(gappy):
+    fractions = []
+    describe(gappy, fractions.append)
+    assert fractions == sorted(fractions)
+    assert 0.0 < fractions[-1] <= 1.0
