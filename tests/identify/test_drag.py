@@ -15,6 +15,7 @@ from analysis.identify._drag import (
 from analysis.identify.drag_torque import HALF_AIR_DENSITY_KG_PER_M3
 from analysis.models import STRUCTURES
 from rigd.beam import mode_shape
+from rigd.runtime.computations import ForkedComputation
 
 pytestmark = pytest.mark.fit
 
@@ -57,6 +58,19 @@ def test_drag_leaves_noise_only(uniform, refitted):
     assert refitted.is_nearly_white(refitted.likeliest_fit)
     names = [candidate.name for candidate in refitted.candidates]
     assert sorted(names) == sorted(STRUCTURES)
+
+
+def test_fits_with_drag_reach_another_process(refitted):
+    """A report has them computed in a copy of its process, and stores them."""
+    with ForkedComputation(lambda: refitted) as copy:
+        received = copy.value()
+    expected, found = refitted.likeliest_fit, received.likeliest_fit
+    np.testing.assert_array_equal(found.residual, expected.residual)
+    series_nm = np.sin(0.01 * np.arange(refitted.comparison.torque_nm.size))
+    np.testing.assert_array_equal(
+        received.comparison.drag.band_spectrum(series_nm),
+        refitted.comparison.drag.band_spectrum(series_nm),
+    )
 
 
 def test_size_of_drag_is_right(refitted):
