@@ -4,9 +4,8 @@ A quick look, a report, a campaign and an exported model of one session need the
 first of them stores the fits in the user's cache folder (``$XDG_CACHE_HOME/rigd/fits``, by default
 ``~/.cache/rigd/fits``), and the others read them there. The key of an entry is a digest of all data
 and settings that enter the fits, and of the programs that compute them: an entry is used only if
-the same programs would fit the same samples with the same settings, and is therefore never out of
-date. The folder may be deleted at any time; the environment variable ``RIGD_NO_CACHE`` switches the
-cache off.
+the same programs would fit the same samples with the same settings. The folder may be deleted at
+any time; the environment variable ``RIGD_NO_CACHE`` switches the cache off.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
+from rigd.runtime import read_plain_file
 from rigd.runtime.computations import ValuePickler
 from rigd.runtime.user_folders import cache_folder
 
@@ -72,8 +72,13 @@ class FitCache:
         if os.environ.get("RIGD_NO_CACHE") or user_folder is None or not hasattr(os, "geteuid"):
             return None
         fits_folder = user_folder / "fits"
-        is_safe = _only_user_writes(user_folder) and _only_user_writes(fits_folder)
-        return cls(fits_folder) if is_safe else None
+        if not (_only_user_writes(user_folder) and _only_user_writes(fits_folder)):
+            return None
+        try:
+            _programs_digest()
+        except (OSError, ImportError):  # a source file or a version that cannot be read
+            return None
+        return cls(fits_folder)
 
     def find(
         self,
@@ -90,11 +95,13 @@ class FitCache:
         """
         path = self._entry_path(measurement, fixed_settings, band_hz)
         try:
-            content = memoryview(path.read_bytes())
+            content = memoryview(read_plain_file(path, _MAX_CACHE_BYTES))
         except OSError:
             return None
         stored_value, stored_digest = content[:-_DIGEST_BYTES], content[-_DIGEST_BYTES:]
-        if blake2b(stored_value, digest_size=_DIGEST_BYTES).digest() != stored_digest:
+        entry_digest = _entry_digest(path)
+        entry_digest.update(stored_value)
+        if entry_digest.digest() != stored_digest:
             return None
         with suppress(OSError):
             os.utime(path)
@@ -121,12 +128,14 @@ class FitCache:
         """
         path = self._entry_path(measurement, fixed_settings, band_hz)
         with suppress(OSError, pickle.PicklingError, AttributeError, TypeError):
-            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # Not with `parents` alone, which leaves the mode of the parents to the umask.
+            self._folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._folder.mkdir(mode=0o700, exist_ok=True)
             # A name of its own until the entry is complete: others may write the same entry.
             with tempfile.NamedTemporaryFile(dir=self._folder, delete=False) as file:
                 part_path = Path(file.name)
                 try:
-                    digesting_file = _DigestingFile(file)
+                    digesting_file = _DigestingFile(file, _entry_digest(path))
                     pickler = _MeasurementPickler(digesting_file, measurement)
                     pickler.dump(_with_name(selection, ""))
                     file.write(digesting_file.digest())
@@ -167,6 +176,14 @@ class FitCache:
                 path.unlink(missing_ok=True)
 
 
+def _entry_digest(path: Path) -> blake2b:
+    """Return the digest to which the content of an entry is added; it depends on the entry's name.
+
+    An entry that was renamed to the name of another one is therefore not used.
+    """
+    return blake2b(path.stem.encode(), digest_size=_DIGEST_BYTES)
+
+
 def _only_user_writes(folder: Path) -> bool:
     """Return whether a folder belongs to this user alone, or does not exist."""
     try:
@@ -192,8 +209,9 @@ def _source_digest() -> bytes:
     source_folder = Path(__file__).resolve().parents[2]
     for program in _PROGRAMS:
         for path in sorted((source_folder / program).rglob("*.py")):
-            digest.update(os.fsencode(path.relative_to(source_folder)) + b"\0")
-            digest.update(path.read_bytes())
+            if path.is_file():  # not the lock of an editor, a link without a target
+                digest.update(os.fsencode(path.relative_to(source_folder)) + b"\0")
+                digest.update(path.read_bytes())
     return digest.digest()
 
 
@@ -208,8 +226,8 @@ def _with_name(selection: Selection, name: str) -> Selection:
 class _DigestingFile:
     """Binary file that computes the digest of what is written to it."""
 
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file, self._digest = file, blake2b(digest_size=_DIGEST_BYTES)
+    def __init__(self, file: IO[bytes], digest: blake2b) -> None:
+        self._file, self._digest = file, digest
 
     def write(self, content: bytes) -> int:
         """Write bytes, and include them in the digest."""

@@ -160,6 +160,20 @@ def test_damaged_entry_is_not_used(cache, stored, measurement, damage):
     assert cache.find(measurement, (), BAND_HZ) is None
 
 
+def test_entry_with_the_name_of_another_is_not_used(cache, stored, measurement, selection):
+    cache.store(selection, measurement, (), (1.0, 50.0))
+    (other,) = set(stored.parent.iterdir()) - {stored}
+    shutil.copy(other, stored)
+    assert cache.find(measurement, (), BAND_HZ) is None
+    assert cache.find(measurement, (), (1.0, 50.0)) is not None
+
+
+def test_pipe_in_place_of_an_entry_is_not_read(cache, stored, measurement):
+    stored.unlink()
+    os.mkfifo(stored)
+    assert cache.find(measurement, (), BAND_HZ) is None
+
+
 def test_least_recently_used_entries_are_removed(tmp_path, measurement, selection):
     folder = tmp_path / "fits"
     FitCache(folder).store(selection, measurement, (), BAND_HZ)
@@ -190,6 +204,23 @@ def test_folder_that_others_can_write_to_is_not_used(user_cache):
         folder.chmod(0o770)
         assert FitCache.of_user() is None
         folder.chmod(0o700)
+
+
+def test_folders_are_private_whatever_the_umask(user_cache, measurement, selection):
+    umask = os.umask(0o002)
+    try:
+        FitCache.of_user().store(selection, measurement, (), BAND_HZ)
+    finally:
+        os.umask(umask)
+    assert FitCache.of_user().find(measurement, (), BAND_HZ) is not None
+
+
+def test_no_cache_if_the_programs_cannot_be_read(user_cache, monkeypatch):
+    def version(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(fit_cache, "installed_version", version)
+    assert FitCache.of_user() is None
 
 
 def test_cache_can_be_switched_off(user_cache, monkeypatch):
