@@ -340,12 +340,15 @@ def whole_record(
     from analysis.identify import select
     from analysis.identify.fit_cache import FitCache
 
-    if (stored_fits := stored_whole_record(record, fixed_parameters, band_hz)) is not None:
-        return stored_fits
     measurement, band_hz = _fitted_measurement(record, band_hz)
-    selection = select(measurement, fixed_settings=fixed_parameters, band_hz=band_hz)
-    if (fit_cache := FitCache.of_user()) is not None:
-        fit_cache.store(selection, measurement, fixed_parameters, band_hz)
+    fit_cache = FitCache.of_user()
+    selection = (
+        None if fit_cache is None else fit_cache.find(measurement, fixed_parameters, band_hz)
+    )
+    if selection is None:
+        selection = select(measurement, fixed_settings=fixed_parameters, band_hz=band_hz)
+        if fit_cache is not None:
+            fit_cache.store(selection, measurement, fixed_parameters, band_hz)
     return WholeRecord(record, selection, band_hz, fixed_parameters)
 
 
@@ -462,20 +465,19 @@ def record_result(
     if not options.settings.are_from_paper:
         fit_welch()  # chosen settings may not suit the record, which is reported at once
     measurement_error = None
+    # Another process takes memory, and this one would only wait for it without Welch fits.
+    are_omitted = options.settings.are_from_paper and welch_exclusion_reason(
+        record, options.band_hz
+    )
+    computed_meanwhile = nullcontext if are_omitted else computed_in_parallel
     if (stored_fits := _stored_fits(record, options)) is not None:
-        with computed_in_parallel(fit_welch) as welch_fits:
+        with computed_meanwhile(fit_welch) as welch_fits:
             whole_fits = _add_structure_fits(stored_fits, options.structures, warning_texts.append)
             on_whole(whole_fits)
             welch_results, omission_remark = welch_fits()
     else:
         fit_whole = partial(_fit_whole_record, record, options)
-        are_omitted = options.settings.are_from_paper and welch_exclusion_reason(
-            record, options.band_hz
-        )
-        # Another process takes memory, and this one would only wait for it without Welch fits.
-        with (
-            nullcontext(fit_whole) if are_omitted else computed_in_parallel(fit_whole)
-        ) as whole_fits_with_warnings:
+        with computed_meanwhile(fit_whole) as whole_fits_with_warnings:
             welch_results, omission_remark = fit_welch()
             if welch_results is not None:
                 on_welch(welch_results)

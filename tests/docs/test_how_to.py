@@ -54,7 +54,7 @@ case "${0##*/} $*" in
     "rigd run chirp --amplitude "*) set -- "$@" --fast --duration 30 --ring-down 3 ;;
     "rigd run chirp"|"rigd run chirp --there-and-back "*|"rigd run chirp --watch-fit")
         set -- "$@" --fast --duration 30 --ring-down 3 ;;
-    "rigd run multisine --amplitude "*) set -- "$@" --period 2 --duration 24 ;;
+    "rigd run multisine "*" --output long") set -- "$@" --period 2 --duration 24 ;;
     "rigd run multisine "*) set -- "$@" --period 2 --duration 6 ;;
     "rigd run modes "*) set -- "$@" --fast --duration 20 --ring-down 3 ;;
     "rigd run move "*|"rigd run touch "*|"rigd run until "*) set -- "$@" --fast ;;
