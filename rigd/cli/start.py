@@ -218,6 +218,7 @@ def _follow_series(
     makes_quick_looks: bool,
 ) -> dict[str, Any]:
     """Show the progress of a series of sessions until its end, and return its final event."""
+    from rigd.daemon.client import DaemonUnreachableError
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
     from rigd.runner.quick_looks import QuickLook
@@ -242,7 +243,14 @@ def _follow_series(
                 )
             if final_event is None and interrupts.count > 1:
                 raise typer.Exit(EXIT_INTERRUPTED)
-            daemon_event = client.next_event(_EVENT_TIMEOUT_S) or {}
+            try:
+                daemon_event = client.next_event(_EVENT_TIMEOUT_S) or {}
+            except DaemonUnreachableError:
+                if final_event is None:
+                    raise
+                # The sessions have ended, and their results are known.
+                progress_line.write_message("No quick look: the daemon has ended.")
+                break
             match daemon_event.get("event"):
                 # No bar between two sessions, where it would mix with the printed path.
                 case "progress" if daemon_event["session"] > ended_session_count:

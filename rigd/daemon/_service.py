@@ -57,6 +57,8 @@ _RATE_WINDOW_POLLS = 10
 """Number of polls over which message rates are measured."""
 _SHUTTING_DOWN_MESSAGE = "The daemon is being shut down."
 """Reason with which requests are refused while the daemon ends."""
+_NO_QUICK_LOOK_REASON = "the daemon ended; python -m analysis.quick_look FILE makes it."
+"""Reason why there is no quick look that was not complete when the daemon ended."""
 
 ReturnType = TypeVar("ReturnType")
 
@@ -187,7 +189,7 @@ class Service:
         if self._task is not None:
             await asyncio.wait([self._task])
         if self._quick_looks is not None:
-            self._quick_looks.close()
+            self._quick_looks.close(_NO_QUICK_LOOK_REASON)
         await self._call_in_worker(self._rig.disconnect)
         if self.state is DaemonState.READY:
             self._state_machine.change_to(DaemonState.IDLE, reason)

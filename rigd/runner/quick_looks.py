@@ -145,14 +145,25 @@ class QuickLookQueue:
                 if self._process is not None:
                     self._process.resume()
 
-    def close(self) -> None:
-        """Kill the running quick look and cancel the waiting quick looks."""
+    def close(self, reason: str = "") -> None:
+        """Kill the running quick look and cancel the waiting quick looks.
+
+        Parameters
+        ----------
+        reason
+            Sentence with which each of them is reported as failed; empty for no report.
+        """
         with self._lock:
             self._is_suspended = True
+            cancelled_sessions = [*self._waiting_sessions]
             self._waiting_sessions.clear()
             if self._process is not None:
+                cancelled_sessions.insert(0, self._session)
                 self._process.stop()
                 self._process = None
+        if reason:
+            for session_path in cancelled_sessions:
+                self._on_result(QuickLook.failed(session_path, reason))
 
     def _ended_quick_look(self) -> Iterator[QuickLook]:
         """Yield the result of the running quick look if it has ended; kill it if it is too slow."""

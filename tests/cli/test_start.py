@@ -15,6 +15,7 @@ from cases import further
 
 from rigd.cli import start
 from rigd.daemon.address import socket_path
+from rigd.daemon.client import DaemonUnreachableError
 
 COMPLETE = {
     "event": "session", "part": None, "outcome": "complete", "reason": "", "scheduled": 1200,
@@ -29,7 +30,10 @@ def process_at(link):
 
 
 class Client:
-    """Client that returns events; a number among them is a number of presses of Ctrl-C."""
+    """Client that returns events; a number among them is a number of presses of Ctrl-C.
+
+    An error among them is raised.
+    """
 
     def __init__(self, interrupts, *events):
         self.interrupts = interrupts
@@ -41,6 +45,8 @@ class Client:
         if isinstance(event, int):
             self.interrupts.count += event
             return None
+        if isinstance(event, Exception):
+            raise event
         return event
 
     def send(self, command):
@@ -130,6 +136,15 @@ def test_ctrl_c_skips_the_quick_look(follow, interrupts):
     ended, _, sent = follow(*interrupts, session(1), series(1), 1)
     assert ended["sessions"][0]["look"] is None
     assert sent == ["stop"] * len(interrupts)
+
+
+def test_quick_look_that_ends_with_the_daemon(follow):
+    lost = DaemonUnreachableError("The connection to the daemon is lost.")
+    ended, calls, _ = follow(session(1), series(1), lost)
+    assert ended["sessions"][0]["look"] is None
+    assert ("write_message", "No quick look: the daemon has ended.") in calls
+    with pytest.raises(DaemonUnreachableError):
+        follow(session(1), lost)
 
 
 def test_second_ctrl_c_leaves_the_session_to_the_daemon(follow):

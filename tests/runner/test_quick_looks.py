@@ -106,6 +106,15 @@ def test_failed_quick_look_states_its_reason(queue, tmp_path, name, error):
     assert result.lines == [f"No quick look at {name}.mcap: {result.error}"]
 
 
+def test_close_reports_quick_looks_that_are_not_made(queue, tmp_path):
+    paths = [tmp_path / f"{name}.mcap" for name in ("waits", "b")]
+    for path in paths:
+        queue.add_session(path)
+    queue.close("the daemon ended.")
+    assert [result.session_path for result in queue.results] == paths
+    assert queue.results[1].lines == ["No quick look at b.mcap: the daemon ended."]
+
+
 def test_no_quick_look_runs_during_a_session(queue, tmp_path, started):
     queue.add_session(tmp_path / "waits.mcap")
     (pid,) = started()
