@@ -314,6 +314,7 @@ class OnlineEstimator:
             select,
         )
         from analysis.record import RecordError
+        from analysis.results import whole_record
         from analysis.validity import record_validity
 
         started_s = time.monotonic()
@@ -326,8 +327,11 @@ class OnlineEstimator:
             order_verdicts: tuple[OrderVerdict, ...] = ()
             linear_fit = None
             if whole:
-                last_selection = self._last_selection if from_last else None
-                selection = select(measurement, band_hz=band_hz, earlier=last_selection)
+                if from_last:
+                    selection = select(measurement, band_hz=band_hz, earlier=self._last_selection)
+                else:
+                    # The user's cache keeps it for the quick look and reports of the session.
+                    selection = whole_record(record).selection
                 self._last_selection = selection
                 headline, analysis = selection.headline, selection.analysis
                 findings = selection.verdict.findings

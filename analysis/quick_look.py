@@ -146,16 +146,16 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
     """
     from analysis.applicability import record_band_hz
     from analysis.identify import Measurement, MeasurementError, fit_freest_alone
-    from analysis.results import whole_record
+    from analysis.results import stored_whole_record, whole_record
     from analysis.validity import record_validity, stated_validity
 
     remark_sentences = []
     duration_s = record.time_s.size / record.rate_hz
     headline: Headline
     findings: tuple[Finding, ...]
+    fit_or_read = whole_record if duration_s <= _LONGEST_FULL_ANALYSIS_S else stored_whole_record
     try:
-        if duration_s <= _LONGEST_FULL_ANALYSIS_S:
-            whole_fits = whole_record(record)
+        if (whole_fits := fit_or_read(record)) is not None:
             headline, findings, validity = (
                 whole_fits.headline,
                 whole_fits.verdict.findings,

@@ -206,13 +206,15 @@ def quantities(estimate):
 
 def test_analysis_starts_from_the_last_on_request(session, monkeypatch):
     headline = SimpleNamespace(
-        visible_modes=(), fit=SimpleNamespace(plant=Plant(PAPER_BEAM, PAPER_DAMPING))
+        visible_modes=(),
+        uniform_beam=None,
+        fit=SimpleNamespace(plant=Plant(PAPER_BEAM, PAPER_DAMPING)),
     )
     verdict = SimpleNamespace(findings=(), alpha=None, lambda_=None)
     selected = SimpleNamespace(headline=headline, verdict=verdict, analysis=None)
     started_from = []
 
-    def select(*_, band_hz, earlier):
+    def select(*_, earlier=None, **__):
         started_from.append(earlier)
         return selected
 

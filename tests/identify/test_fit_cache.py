@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 
 import analysis.identify
+from analysis import quick_look
 from analysis.identify import Measurement, fit_cache, select
 from analysis.identify.fit_cache import FitCache
 from analysis.models import WelchSettings
+from analysis.online import OnlineEstimator
+from analysis.quick_look import make_quick_look
 from analysis.record import load_record
 from analysis.results import AnalysisOptions, record_result, whole_record
+from rigd.session import read_session
 from rigd.testing import chirp_signals
 
 pytestmark = [
@@ -188,6 +192,23 @@ def test_least_recently_used_entries_are_removed(tmp_path, measurement, selectio
     assert cache.find(measurement, (), (2.0, 50.0)) is not None
     assert cache.find(measurement, (), (1.0, 50.0)) is None
     assert len(list(folder.iterdir())) == 2
+
+
+def test_fits_during_a_session_are_used_for_its_file(session, user_cache, monkeypatch):
+    recorded = read_session(session)
+    estimator = OnlineEstimator(recorded.metadata, recorded.segments)
+    estimator.feed(recorded.samples)
+    estimator.estimate(len(recorded.samples) // 2)  # of the freest structure alone
+    assert not user_cache.exists()
+    estimate = estimator.estimate(whole=True)
+    monkeypatch.setattr(analysis.identify, "select", None)
+    assert whole_record(load_record(session)).headline.parameters == estimate.headline.parameters
+    monkeypatch.setattr(quick_look, "_LONGEST_FULL_ANALYSIS_S", 10.0)  # of the longer record
+    content = make_quick_look(session)
+    assert [mode["damping_ratio"]["value"] for mode in content["modes"]] == [
+        mode.damping_ratio.value for mode in estimate.headline.modes
+    ]
+    assert not any("alone was fitted" in flag for flag in content["flags"])
 
 
 def test_cache_that_cannot_be_written_is_no_error(tmp_path, measurement, selection):
