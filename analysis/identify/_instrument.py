@@ -47,6 +47,11 @@ both fell to 0 at once, the angle would not lag the reference, as it does in the
 _RELATIVE_POWER_FLOOR: Final = 1e-12
 """Minimum assumed power of the reference at a frequency, relative to its largest power."""
 
+_MIN_POWER_RATIO: Final = 10.0
+"""Power of the angle that the reference explains, relative to the power that it would explain by
+chance, below which the angle does not follow the reference. Between the bands of narrow sweeps the
+reference has hardly any power, and noise of the angle would be taken for a response to it."""
+
 
 def reference_coherent_angle(
     angle_rad: NDArray[np.float64],
@@ -74,11 +79,27 @@ def reference_coherent_angle(
 
     lag_s = np.fft.fftfreq(padded_length) * (padded_length / rate_hz)
     lag_window = np.exp(-0.5 * (lag_s / _CORRELATION_LAG_WINDOW_S) ** 2)
+    # Number of independent frequencies whose powers are averaged.
+    independent_estimates = angle_rad.size / np.sum(lag_window**2)
 
     def smooth_over_frequency(power_spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
         return np.fft.rfft(lag_window * np.fft.irfft(power_spectrum, padded_length))
 
     angle_spectrum, reference_spectrum = padded_spectrum(angle_rad), padded_spectrum(reference_rad)
+
+    def significant_response(
+        cross_spectrum: NDArray[np.complex128],
+        input_power: NDArray[np.float64],
+        output_power: NDArray[np.float64],
+    ) -> NDArray[np.complex128]:
+        """Return the response from an input to an output; 0 where it is not significant."""
+        response = cross_spectrum / input_power
+        explained_power = np.abs(response) ** 2 * input_power
+        # A response that is noise explains this power of the output on average.
+        power_by_chance = np.maximum(output_power - explained_power, 0.0) / independent_estimates
+        return np.where(explained_power > _MIN_POWER_RATIO * power_by_chance, response, 0.0)
+
+    angle_power = smooth_over_frequency(np.abs(angle_spectrum) ** 2).real
     cross_spectrum, reference_power = (
         smooth_over_frequency(angle_spectrum * reference_spectrum.conj()),
         smooth_over_frequency(np.abs(reference_spectrum) ** 2).real,
@@ -86,7 +107,9 @@ def reference_coherent_angle(
     if not reference_power.max() > 0:
         return np.zeros(angle_rad.size)
     reference_power = np.maximum(reference_power, _RELATIVE_POWER_FLOOR * reference_power.max())
-    coherent_spectrum = cross_spectrum / reference_power * reference_spectrum
+    coherent_spectrum = (
+        significant_response(cross_spectrum, reference_power, angle_power) * reference_spectrum
+    )
     if torque_nm is not None:
         # Use the part of the torque that is no smooth response to the reference.
         torque_spectrum = padded_spectrum(torque_nm)
@@ -100,10 +123,12 @@ def reference_coherent_angle(
         reference_free_torque_power = np.maximum(
             reference_free_torque_power, _RELATIVE_POWER_FLOOR * reference_free_torque_power.max()
         )
-        angle_per_torque = (
+        angle_per_torque = significant_response(
             smooth_over_frequency(angle_spectrum * torque_spectrum.conj())
-            - cross_spectrum * torque_per_reference.conj()
-        ) / reference_free_torque_power
+            - cross_spectrum * torque_per_reference.conj(),
+            reference_free_torque_power,
+            angle_power - np.abs(cross_spectrum) ** 2 / reference_power,
+        )
         coherent_spectrum += angle_per_torque * (
             torque_spectrum - torque_per_reference * reference_spectrum
         )

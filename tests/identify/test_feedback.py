@@ -118,6 +118,26 @@ def test_a_reference_may_end_anywhere():
 
 
 @pytest.mark.fit
+def test_noise_between_narrow_bands_is_no_response():
+    """There, the reference has hardly any power, such as that of the ends of its sweeps."""
+    n, rate_hz, rng = 20_000, 125.0, np.random.default_rng(1)
+    time_s = np.arange(n) / rate_hz
+    reference = sum(
+        np.hanning(n) ** 2 * np.sin(2 * np.pi * (first_hz + time_s / 160.0) * time_s)
+        for first_hz in (2.0, 16.0, 44.0)
+    )
+    reference += rng.normal(size=n) * 3e-5
+    noise = rng.normal(size=n) * 0.01
+    found = reference_coherent_angle(reference + noise, reference, rate_hz)
+    frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
+    between = (frequency_hz > 25.0) & (frequency_hz < 40.0)
+    found_power, noise_power = (
+        np.sum(np.abs(np.fft.rfft(signal)[between]) ** 2) for signal in (found, noise)
+    )
+    assert found_power < 1e-5 * noise_power
+    assert found == pytest.approx(reference, abs=0.01)
+
+
 def test_drift_does_not_reduce_the_coherent_part(controlled):
     measured = controlled("III", 2)
     drift = np.linspace(0.0, 0.2, measured.angle_rad.size)
