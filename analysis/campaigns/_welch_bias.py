@@ -100,8 +100,8 @@ def welch_biases(
     """Compare the Welch fits with the pooled estimates that describe the records.
 
     The pooled estimates serve as references. The biases are in the order of damping structure, then
-    of weighting. A structure whose whole-record residual is more than noise is left out, because
-    its pooled estimate is no reference.
+    of weighting. A structure with a misfit above `MAX_REFERENCE_MISFIT` is left out, because its
+    pooled estimate is no reference.
     """
     biases = []
     pooled_by_name = {

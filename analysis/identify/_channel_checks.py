@@ -10,6 +10,7 @@ smaller weight. Resonances have no larger weight than others: their frequencies 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from analysis.identify._finding import Finding
 from analysis.record_checks import longest_run
 from analysis.record_ticks import torque_extremes
-from rigd.beam import Damping, transfer
+from rigd.beam import Damping, ResponseGrid
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -147,12 +148,12 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained_samples])
     angle_power = np.abs(angle_spectrum) ** 2
     is_driven_bin = angle_power > _MIN_DRIVEN_POWER_FRACTION * angle_power.max()
-    beam = comparison.measurement.nominal_plant.beam
-    expected_response = transfer(
-        2j * np.pi * comparison.frequency_hz[is_driven_bin],
-        beam,
-        Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S),
+    plant = replace(
+        comparison.measurement.nominal_plant, damping=Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S)
     )
+    [expected_response] = ResponseGrid(
+        2j * np.pi * comparison.frequency_hz[is_driven_bin]
+    ).evaluate(plant)
     expected_torque = angle_spectrum[is_driven_bin] * expected_response
     group_size = max(1, min(_MAX_GROUP_SIZE, expected_torque.size // _MIN_GROUPS))
     first_frequencies = np.arange(0, expected_torque.size, group_size)

@@ -361,7 +361,11 @@ def _fit_candidates(model: RecordModel) -> RecordModel:
     """Refit the candidates with the drag of the model, or with its small effect if it is large."""
     linear_candidates, modes_with_drag = model.linear_candidates, model.modes_with_drag
     if modes_with_drag is not None:
-        candidates_with_drag = replace(linear_candidates, comparison=modes_with_drag.comparison)
+        # Drag is known now, and so is the part of the angle that follows the reference.
+        comparison = modes_with_drag.comparison.use_reference_coherent_angle(
+            linear_candidates.likeliest_fit.plant
+        )
+        candidates_with_drag = replace(linear_candidates, comparison=comparison)
         return replace(
             model,
             candidate_set=candidates_with_drag.refit_with_additional_effect(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns import best_models
+from analysis.campaigns._welch_bias import MAX_REFERENCE_MISFIT
 from analysis.campaigns.specimen_sentences import pooled_title
 from analysis.models import STRUCTURES, estimator_text
 from analysis.report.table import (
@@ -367,8 +368,10 @@ def bias_table(campaign: CampaignResult) -> Table:
         ),
         tuple(table_rows),
         (
-            "Types whose whole-record residual is noise. Significant: other than zero at the 0.1 % "
-            "level. A bias is the same in every session: it does not show in the std of Table 3.",
+            "Types whose whole-record residual has at most "
+            f"{MAX_REFERENCE_MISFIT:g} times the power of the noise. Significant: other than zero "
+            "at the 0.1 % level. A bias is the same in every session: it does not show in the std "
+            "of Table 3.",
             *unsupported_order_notes(unsupported_orders),
         ),
         is_grouped=True,

@@ -175,6 +175,23 @@ def test_other_frequencies_are_no_wrong_unit(ends):
     assert list(sign_and_unit_findings(comparison)) == []
 
 
+def test_stated_tool_inertia_belongs_to_the_expected_torque():
+    """It exceeds the torque of the beam at most frequencies, with the opposite sign."""
+    beam_alone, tool_inertia_kg_m2 = record(), 5e-4
+    acceleration = np.gradient(np.gradient(beam_alone.angle_rad, 1 / RATE_HZ), 1 / RATE_HZ)
+    measurement = replace(
+        beam_alone,
+        torque_nm=beam_alone.torque_nm + tool_inertia_kg_m2 * acceleration,
+        tool_inertia_kg_m2=tool_inertia_kg_m2,
+    )
+    comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
+    assert list(sign_and_unit_findings(comparison)) == []
+    unstated = Comparison.from_measurement(
+        replace(measurement, tool_inertia_kg_m2=0.0), (0.0, 50.0)
+    )
+    assert list(sign_and_unit_findings(unstated)) != []
+
+
 def test_unit_of_a_short_record_is_not_that_of_its_resonances():
     """Of a beam that rings on at the end: few frequencies, most of them in a resonance."""
     whole = record(noise_nm=0.0)
