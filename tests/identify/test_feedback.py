@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Comparison, Measurement, fit_freest_alone, fit_record
+from analysis.identify import Comparison, Measurement, fit_freest_alone, fit_record, select
 from analysis.identify._instrument import reference_coherent_angle
 from analysis.models import STRUCTURES
 from analysis.record import load_record
@@ -118,6 +118,26 @@ def test_a_reference_may_end_anywhere():
 
 
 @pytest.mark.fit
+@pytest.mark.fit
+def test_noise_that_moves_the_motor_does_not_bias_a_fit_with_drag(sessions, controlled):
+    """At this amplitude drag of unknown size is fitted, with the whole angle as input."""
+    amplitude = 0.15
+    deviations = []
+    for seed in (1, 2):
+        larger, noisy = sessions("III", tool_inertia_kg_m2=CLAMP), controlled("III", seed)
+        selection = select(
+            replace(
+                noisy,
+                angle_rad=noisy.angle_rad - (1 - amplitude) * larger.angle_rad,
+                torque_nm=noisy.torque_nm - (1 - amplitude) * larger.torque_nm,
+                reference_rad=amplitude * noisy.reference_rad,
+            )
+        )
+        assert "air drag" in {finding.kind for finding in selection.verdict.findings}
+        deviations.append(deviates(selection.candidates[0].fit))
+    assert abs(np.mean(deviations)) < 2.0
+
+
 def test_noise_between_narrow_bands_is_no_response():
     """There, the reference has hardly any power, such as that of the ends of its sweeps."""
     n, rate_hz, rng = 20_000, 125.0, np.random.default_rng(1)
