@@ -363,7 +363,7 @@ def _fit_candidates(model: RecordModel) -> RecordModel:
     if modes_with_drag is not None:
         # Drag is known now, and so is the part of the angle that follows the reference.
         comparison = modes_with_drag.comparison.use_reference_coherent_angle(
-            linear_candidates.likeliest_fit.plant
+            modes_with_drag.modal_fit.model
         )
         candidates_with_drag = replace(linear_candidates, comparison=comparison)
         return replace(
