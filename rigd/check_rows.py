@@ -1,7 +1,7 @@
 """Rows of ``rigd check``: what was checked, its value and the result."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 
 
@@ -37,6 +37,17 @@ class CheckRow:
     """Short name by which a session can accept a failure of this check (`--accept`).
 
     It is empty for checks of devices and for checks that cannot fail."""
+
+    def __post_init__(self) -> None:
+        """Refuse values of other types, except that the text of a result ("failed") is accepted.
+
+        Installed packages make rows too, and a failed one must not be taken for another.
+        """
+        object.__setattr__(self, "verdict", CheckResult(self.verdict))
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name != "verdict" and not isinstance(value, str):
+                raise TypeError(f"CheckRow.{field.name} must be text, not {type(value).__name__}")
 
     def as_dict(self) -> dict[str, str]:
         """Return the fields of the row by name, for a JSON document."""

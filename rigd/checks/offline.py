@@ -1,6 +1,6 @@
 """Checks of profile and EDS file alone: values, record, wiring, and what packages add."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from inspect import signature
 from math import radians, sin
@@ -220,8 +220,7 @@ def added_device_rows(profile: Profile) -> Iterator[CheckRow]:
             yield CheckRow("devices", device_kind.name, plugin_owner.label, "", CheckResult.OK)
         if device_kind.check_rows is not None:
             with plugin_errors(plugin_owner):
-                for row in device_kind.check_rows(profile.rig):
-                    yield replace(row, name=DEVICE_SETTINGS_ROW)
+                yield from _named_rows(device_kind.check_rows(profile.rig), DEVICE_SETTINGS_ROW)
 
 
 CONTROLLER_ROW = "controller"
@@ -249,7 +248,9 @@ def added_controller_rows(profile: Profile) -> Iterator[CheckRow]:
         controller_kind = CONTROLLERS.load(plugin_owner)
         with plugin_errors(plugin_owner):
             declared_rows = (
-                () if controller_kind.check_rows is None else tuple(controller_kind.check_rows(rig))
+                ()
+                if controller_kind.check_rows is None
+                else tuple(_named_rows(controller_kind.check_rows(rig), CONTROLLER_ROW))
             )
     except (ControllerError, ControlDesignError, PluginError) as error:
         yield CheckRow(
@@ -265,8 +266,21 @@ def added_controller_rows(profile: Profile) -> Iterator[CheckRow]:
         grade(fail=not largest_start_torque_nm <= _MAX_START_TORQUE_FRACTION * rig.torque_limit_nm),
         name=CONTROLLER_ROW,
     )
+    yield from declared_rows
+
+
+def _named_rows(declared_rows: Iterable[CheckRow], row_name: str) -> Iterator[CheckRow]:
+    """Yield the rows that a part of the rig declares, with the name of such rows.
+
+    Raises
+    ------
+    TypeError
+        If one of them is not a `CheckRow`.
+    """
     for row in declared_rows:
-        yield replace(row, name=CONTROLLER_ROW)
+        if not isinstance(row, CheckRow):
+            raise TypeError(f"check_rows has returned a {type(row).__name__}, and not a CheckRow")
+        yield replace(row, name=row_name)
 
 
 def _can_identifier_row(found_text: str, check_result: CheckResult) -> CheckRow:

@@ -121,6 +121,23 @@ def test_unstable_loop_and_failed_row_refuse_a_session(packages, tmp_path):
     assert "30 N·m/rad" in failed.text
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("grade(fail=stiffness > 20)", '"failed"', "controller, stiffness: 9 N·m/rad"),
+        ("grade(fail=stiffness > 20)", "None", "None is not a valid CheckResult"),
+        ('"at most 20"', "20", "CheckRow.wanted must be text, not int"),
+        ("yield CheckRow", "yield", "returned a tuple, and not a CheckRow"),
+    ],
+)
+def test_row_of_a_wrong_form_refuses_a_session(packages, tmp_path, old, new, message):
+    module = packages / "lab_laws.py"
+    module.write_text(module.read_text().replace(old, new))
+    (failed,) = run_offline_checks(load_profile(write_rig(tmp_path, "own"))).failed
+    assert (failed.name, failed.acceptable) == ("controller", False)
+    assert message in failed.text
+
+
 def test_code_without_matrices_is_partly_predicted(packages, tmp_path):
     profile = load_profile(write_rig(tmp_path, "own"))
     rows = {(row.group, row.what): row for row in check_rig(profile)}

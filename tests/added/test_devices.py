@@ -8,8 +8,10 @@ import pytest
 from cases import further
 from packages import DEVICES, install, rigd_with
 
+from rigd.checks import run_offline_checks
 from rigd.devices import actuation_target, check_selection, open_devices
 from rigd.devices.contracts import DeviceError
+from rigd.errors import FailureError
 from rigd.plugins import PluginError, check_plugin, find_plugin, installed_plugins
 from rigd.profile import ProfileError, load_profile
 from rigd.session import read_session
@@ -113,6 +115,26 @@ def test_failed_row_refuses_a_session(packages, tmp_path, rigd_here):
     done = rigd_here("run", "hold", "--profile", path, "--fast")
     assert done.returncode != 0
     assert "device_settings" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("grade(fail=gain > 200)", '"failed"', "gain: 110.0 %"),
+        ("grade(fail=gain > 200)", '"fail"', "'fail' is not a valid CheckResult"),
+        ("grade(fail=gain > 200)", "False", "False is not a valid CheckResult"),
+        ('f"{gain} %"', "gain", "CheckRow.found must be text, not float"),
+        ("yield CheckRow", "yield", "returned a tuple, and not a CheckRow"),
+    ],
+)
+def test_row_of_a_wrong_form_refuses_a_session(packages, tmp_path, old, new, message):
+    module = packages / "lab_devices.py"
+    module.write_text(module.read_text().replace(old, new))
+    profile = load_profile(write_rig(tmp_path))
+    with pytest.raises((FailureError, PluginError)) as refusal:
+        run_offline_checks(profile).require_passed()
+    assert message in str(refusal.value)
+    assert "lab-devices 1.2" in str(refusal.value) or new == '"failed"'
 
 
 @pytest.mark.process
