@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import rigd
@@ -14,7 +15,6 @@ from analysis.report.folder import OutputError, check_new_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
-    from pathlib import Path
     from typing import BinaryIO
 
     from analysis.exchange._table import ExportTable
@@ -29,15 +29,19 @@ SUFFIXES: Final = (".csv", ".mat", *_UNIVERSAL_SUFFIXES)
 
 
 def export_record(
-    session: Path, target: Path, *, binary: bool = False, part_s: PartOption | None = None
+    session: Path | str,
+    target: Path | str,
+    *,
+    binary: bool = False,
+    part_s: PartOption | None = None,
 ) -> ExportTable:
     """Write the samples of a session, as recorded, to a file for another program.
 
     Parameters
     ----------
-    session : Path
+    session : Path or str
         Session file.
-    target : Path
+    target : Path or str
         New file, whose suffix (one of `SUFFIXES`) selects the format.
     binary : bool
         Whether a universal file has 8-byte floats instead of text.
@@ -65,12 +69,12 @@ def export_record(
 
     Examples
     --------
-    >>> from pathlib import Path
     >>> from analysis.exchange import export_record
-    >>> table = export_record(Path("session.mcap"), Path("record.csv"))
+    >>> table = export_record("session.mcap", "record.csv")
     >>> [column.name for column in table.columns][:3]
     ['tick', 'angle_reference_rad', 'angle_rad']
     """
+    session, target = Path(session), Path(target)
     check_target(target, binary=binary)
     table = record_table(session, part_s)
     _write_table(table, target, binary=binary)
@@ -78,8 +82,8 @@ def export_record(
 
 
 def export_frf(
-    session: Path,
-    target: Path,
+    session: Path | str,
+    target: Path | str,
     settings: WelchSettings,
     band_hz: tuple[float, float] | None = None,
     *,
@@ -99,6 +103,7 @@ def export_frf(
     band_hz : tuple of float, optional
         First and last frequency; by default chosen for the record.
     """
+    session, target = Path(session), Path(target)
     check_target(target, binary=binary)
     table = frf_table(session, settings, band_hz)
     _write_table(table, target, binary=binary)
@@ -106,20 +111,20 @@ def export_frf(
 
 
 def export_model(
-    source: Path,
-    target: Path,
-    options: ModelOptions,
+    source: Path | str,
+    target: Path | str,
+    options: ModelOptions | None = None,
     on_step: Callable[[str], None] = lambda _step: None,
 ) -> LinearModel:
     """Write a linear model of the flexible beam to a file: modal model and state-space matrices.
 
     Parameters
     ----------
-    source : Path
+    source : Path or str
         Session file, which is analysed, or the document of ``analyze --json``.
-    target : Path
+    target : Path or str
         New file, whose suffix (a key of `MODEL_FORMATS`) selects the format.
-    options : ModelOptions
+    options : ModelOptions, optional
         Kind of model, input, and number of states.
     on_step : callable, optional
         Called before each step with the name of the step.
@@ -140,8 +145,14 @@ def export_model(
     rigd.session.SessionError, analysis.record.RecordError, analysis.identify.MeasurementError
         If the session cannot be read or analysed.
     """
-    from analysis.linear_model import identify_session, linear_model, read_identified_model
+    from analysis.linear_model import (
+        ModelOptions,
+        identify_session,
+        linear_model,
+        read_identified_model,
+    )
 
+    source, target = Path(source), Path(target)
     _check_suffix(target, MODEL_FORMATS)
     check_new_file(target, "The file")
     is_session_file = source.suffix.lower() == ".mcap"
@@ -149,7 +160,7 @@ def export_model(
     identified_model = (
         identify_session(source) if is_session_file else read_identified_model(source)
     )
-    model = linear_model(identified_model, options, on_step)
+    model = linear_model(identified_model, options or ModelOptions(), on_step)
     on_step("file")
     variables = {**model.variables(), "exported_by": f"rigd {rigd.__version__}"}
     with _open_new_file(target) as stream:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -148,14 +148,15 @@ class LinearModel:
         Random samples of the parameters with their state spaces.
     """
 
-    identified: IdentifiedModel
+    # The members without repr would print thousands of lines in a notebook.
+    identified: IdentifiedModel = field(repr=False)
     kind: Literal["beam", "modal"]
-    uncertain_dynamics: UncertainDynamics
+    uncertain_dynamics: UncertainDynamics = field(repr=False)
     options: ModelOptions
-    system: StateSpace
+    system: StateSpace = field(repr=False)
     structure: PoleStructure
-    accuracy: Accuracy
-    posterior: PosteriorSamples
+    accuracy: Accuracy = field(repr=False)
+    posterior: PosteriorSamples = field(repr=False)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -252,7 +253,7 @@ class LinearModel:
 
 def linear_model(
     identified: IdentifiedModel,
-    options: ModelOptions,
+    options: ModelOptions = ModelOptions(),
     on_step: Callable[[str], None] = lambda _step: None,
 ) -> LinearModel:
     """Convert an identified model to a state space.
@@ -263,7 +264,7 @@ def linear_model(
     ----------
     identified : IdentifiedModel
         Models of the analysis.
-    options : ModelOptions
+    options : ModelOptions, optional
         Options of the export.
     on_step : callable, optional
         Function that is called with the name of each step before it begins.

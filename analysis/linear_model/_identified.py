@@ -314,12 +314,12 @@ class IdentifiedModel:
         )
 
 
-def read_identified_model(path: Path) -> IdentifiedModel:
+def read_identified_model(path: Path | str) -> IdentifiedModel:
     """Read the identified model from a document of ``analyze --json``.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         Document in JSON.
 
     Raises
@@ -329,6 +329,7 @@ def read_identified_model(path: Path) -> IdentifiedModel:
     LinearModelError
         If the document has several headlines and none for all sessions together.
     """
+    path = Path(path)
     document = read_document(path)
     headline_name, headline = select_headline(path, document)
     assert isinstance(document, dict)
@@ -368,12 +369,12 @@ def read_identified_model(path: Path) -> IdentifiedModel:
     )
 
 
-def identify_session(path: Path) -> IdentifiedModel:
+def identify_session(path: Path | str) -> IdentifiedModel:
     """Analyse the record of a session, and return the identified model.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         Session file.
 
     Raises
@@ -386,6 +387,7 @@ def identify_session(path: Path) -> IdentifiedModel:
     from analysis.record import load_record
     from analysis.results import finite_json, whole_record
 
+    path = Path(path)
     record = load_record(path)
     record_analysis = whole_record(record)
     headline_json = finite_json(record_analysis.headline_json())

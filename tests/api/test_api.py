@@ -30,7 +30,7 @@ def record(workspace):
 def test_example_of_the_document_runs_as_written(workspace, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     blocks = re.findall(r"^```python\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 7
+    assert len(blocks) == 8
     exec("\n".join(blocks), {"__name__": "__main__"})
     printed = capsys.readouterr().out
     assert "21500 samples at 1000 Hz, outcome complete" in printed
@@ -44,6 +44,7 @@ def test_example_of_the_document_runs_as_written(workspace, monkeypatch, capsys)
         assert re.search(rf"^type {kind}: zeta = [\d.e-]+ ± [\d.e-]+, cost", printed, re.MULTILINE)
     assert "2 sessions, 0 failed" in printed
     assert "PooledParameter(name='zeta'" in printed
+    assert "(16, 16)" in printed
 
 
 def test_load_and_frf_match_the_command(record, workspace):

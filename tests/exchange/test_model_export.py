@@ -13,6 +13,7 @@ from scipy.signal import StateSpace, cont2discrete, lsim
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
+from analysis.exchange import export_model
 from analysis.identify import ModalModel
 from analysis.linear_model import ModelOptions, identify_session, linear_model
 from rigd.beam import Beam, Damping, Plant
@@ -399,6 +400,15 @@ def test_impossible_export_is_refused_in_one_sentence(
         assert word in result.stderr
     assert "Traceback" not in result.output
     assert not (tmp_path / "model.npz").exists()
+
+
+def test_python_takes_texts_as_paths_and_needs_no_options(tmp_path):
+    source, target = tmp_path / "results.json", tmp_path / "model.npz"
+    source.write_text(json.dumps(document()))
+    model = export_model(str(source), str(target))
+    assert target.exists()
+    assert model.options == ModelOptions()
+    assert len(repr(model)) < 1000
 
 
 def test_nothing_is_overwritten_and_endings_are_known(export, analyze, tmp_path):

@@ -89,7 +89,7 @@ def test_exported_record_is_imported_unchanged(
 @pytest.mark.fit
 def test_imported_record_has_the_same_analysis(simulated, specimen, tmp_path):
     record = load_record(simulated)
-    export_record(simulated, tmp_path / "a.csv")
+    export_record(str(simulated), str(tmp_path / "a.csv"))
     segments_s = {"rest": (0, 0.5), "sweep": (0.5, 20.5), "ring_down": (20.5, 21.5)}
     import_record(
         tmp_path / "a.csv", tmp_path / "a.mcap", plan_for(specimen, segments_s=segments_s)
@@ -136,7 +136,7 @@ def response(simulated):
 
 
 def test_response_as_csv(simulated, response, tmp_path):
-    export_frf(simulated, tmp_path / "f.csv", SETTINGS)
+    export_frf(str(simulated), str(tmp_path / "f.csv"), SETTINGS)
     names = (
         "frequency_hz", "response_real_nm_per_rad", "response_imaginary_nm_per_rad", "coherence"
     )  # fmt: skip
