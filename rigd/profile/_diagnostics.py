@@ -358,6 +358,10 @@ def unknown_key_message(profile_key: str, profile_values: Mapping[str, Any]) -> 
             f"{profile_key} = {_shown_value(profile_values[profile_key])} must be a section; write "
             f"[{profile_key}] and its keys below."
         )
+    if package_message := _section_of_package_message(
+        profile_key.partition(".")[0], profile_values
+    ):
+        return package_message
     section = profile_key.rpartition(".")[0]
     section_keys = [k for k in key_types() if k.rpartition(".")[0] == section]
     if not section_keys:
@@ -388,6 +392,30 @@ def unknown_key_message(profile_key: str, profile_values: Mapping[str, Any]) -> 
         f"{profile_key} is unknown; {f'[{section}]' if section else 'the top'} has "
         f"{key_names_text}."
     )
+
+
+def _section_of_package_message(section: str, profile_values: Mapping[str, Any]) -> str:
+    """Return the message for an unknown section of a package's part, or "" if it is of none."""
+    if section in SECTIONS:
+        return ""
+    for noun, registry, keys in (
+        ("device", DEVICES, ("devices.drive", "devices.sensor")),
+        ("controller", CONTROLLERS, ("control.controller",)),
+    ):
+        is_installed = section in registry.names()
+        naming_keys = [key for key in keys if profile_values.get(key) == section]
+        if naming_keys and not is_installed:
+            return (
+                f'{naming_keys[0]} = "{section}": no installed package has this {noun} (rigd '
+                "plugins lists those of packages); install its package in this environment."
+            )
+        if is_installed and not naming_keys:
+            lines = " or ".join(f'{key.rpartition(".")[2]} = "{section}"' for key in keys)
+            return (
+                f"[{section}] is the section of the {noun} {section}, which this profile does not "
+                f"use; write {lines} in the section [{keys[0].partition('.')[0]}]."
+            )
+    return ""
 
 
 _REQUIREMENT_BY_ERROR_TYPE = {  # Required value, by the type of pydantic's error

@@ -107,6 +107,17 @@ def test_wrong_values_are_named_as_those_of_other_sections(
         load_profile(write_rig(tmp_path, name, section, **values))
 
 
+def test_section_without_its_package_or_its_line_is_explained(tmp_path, monkeypatch):
+    with pytest.raises(ProfileError, match=r'controller = "spare": no installed package has'):
+        load_profile(write_rig(tmp_path, "spare", ""))
+    install(tmp_path / "site", "spare", "1", "", f"[{GROUP}]\nspare = spare:SPARE\n")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    path = write_profile(tmp_path, {"name": "lab"})
+    path.write_text(f"{path.read_text()}\n[spare]\n")  # all keys have defaults
+    with pytest.raises(ProfileError, match=r'write controller = "spare" in the section .control'):
+        load_profile(path)
+
+
 def test_unstable_loop_and_failed_row_refuse_a_session(packages, tmp_path):
     unstable = write_rig(
         tmp_path, "statespace",

@@ -74,6 +74,17 @@ def test_wrong_values_are_named_as_those_of_other_sections(packages, tmp_path, o
         load_profile(write_rig(tmp_path, SECTIONS.replace(old, new)))
 
 
+def test_section_without_its_package_or_its_line_is_explained(tmp_path, monkeypatch):
+    section = "[spare]\nspeed_percent = 1\n"
+    with pytest.raises(ProfileError, match=r'sensor = "spare": no installed package has this dev'):
+        load_profile(write_rig(tmp_path, section, drive="sim", sensor="spare"))
+    install(tmp_path / "site", "spare", "1", "", "[rigd.devices]\nspare = spare:SPARE\n")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    lines = r'drive = "spare" or sensor = "spare" in the section \[devices\]'
+    with pytest.raises(ProfileError, match=rf"\[spare\] is the section of the device .*{lines}"):
+        load_profile(write_rig(tmp_path, section, drive="sim", sensor="sim"))
+
+
 def test_added_devices_pass_the_checks(packages, tmp_path):
     rig = load_profile(write_rig(tmp_path)).rig
     for check in DEVICE_CHECKS:
