@@ -7,11 +7,12 @@ profile can name.
 """
 
 import math
+import random
 from collections.abc import Callable
 
 from rigd.devices.contracts import Devices, LineHealth, Wrench
 
-INERTIA_KG_M2, FRICTION_NM_S = 3.5e-3, 7e-3
+INERTIA_KG_M2, FRICTION_NM_S, NOISE = 3.5e-3, 7e-3, 1e-4
 
 
 class RigidHub:
@@ -53,7 +54,10 @@ class RigidHub:
         self.wrench_time_ns = due_ns
 
     def read_wrench(self) -> Wrench:
-        return (0.0, 0.0, 0.0, 0.0, 0.0, self.torque_nm - FRICTION_NM_S * self.speed_rad_s)
+        torque_nm = self.torque_nm - FRICTION_NM_S * self.speed_rad_s
+        # Without noise, rigd takes the sensor for a frozen one, and ends the session.
+        fx, fy, fz, tx, ty, noise_nm = (random.gauss(0.0, NOISE) for _ in range(6))
+        return (fx, fy, fz, tx, ty, torque_nm + noise_nm)
 
     def health(self) -> LineHealth:
         return LineHealth(errors=0, status=0)

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
+from operator import ne
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,11 @@ def test_user_device_turns(tmp_path):
 @pytest.mark.parametrize("check", DEVICE_CHECKS, ids=lambda check: check.__name__.strip("_"))
 def test_user_device_passes_the_contract(check):
     check(module_at(EXAMPLES / "own_device.py").open_rigid_hub())
+
+
+def test_user_device_has_noise():
+    sensor = module_at(EXAMPLES / "own_device.py").open_rigid_hub().sensor
+    assert all(map(ne, sensor.read_wrench(), sensor.read_wrench()))  # else a session ends at once
 
 
 def test_each_example_is_tested_here():

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from packages import rigd_with
 from typer.testing import CliRunner
 
 from rigd.cli.app import app
+from rigd.profile import load_profile
 
 PROJECT = Path(__file__).parents[2]
 
@@ -94,7 +96,7 @@ def test_new_package_runs_as_documented(
 
 @pytest.mark.process
 def test_new_driver_reads_an_instrument_as_documented(tmp_path):
-    (code,) = blocks("your_own_device", "python")
+    code, _ = blocks("your_own_device", "python")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as instrument:
         instrument.bind(("127.0.0.1", 0))
         settings = f'host="127.0.0.1", port={instrument.getsockname()[1]}, timeout_us=1e6'
@@ -111,6 +113,23 @@ def test_new_driver_reads_an_instrument_as_documented(tmp_path):
         answers.join(10.0)
     assert (status, errors) == (0, "")
     assert output.startswith("(1.0, 2.0, 3.0, 4.0, 5.0, 6.0) False LineHealth(")
+
+
+def test_drive_is_declared_as_documented():
+    class Settings:
+        pass
+
+    class MyDrive:
+        def __init__(self, settings):
+            self.settings = settings
+
+    _, code = blocks("your_own_device", "python")
+    exec(code, names := {"MyDrive": MyDrive, "Settings": Settings})
+    profile = load_profile("sim")
+    settings = Settings()
+    opened = names["DEVICE"].open_drive(replace(profile.rig, added_settings=(settings,)))
+    assert opened.drive.settings is settings
+    assert not opened.simulated
 
 
 def blocks(page, language):
