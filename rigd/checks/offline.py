@@ -95,7 +95,7 @@ def profile_rows(profile: Profile) -> Iterator[CheckRow]:
     yield CheckRow(
         "profile",
         "unverified profile values",
-        f"{len(assumed_keys)} of {len(profile.sources)}",
+        f"{len(assumed_keys)} of {len(profile.sources)} assumed",
         "none",
         grade(fail=False, warn=bool(assumed_keys)),
         f"Assumed: {', '.join(assumed_keys)}." if assumed_keys else "",

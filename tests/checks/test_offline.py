@@ -37,7 +37,7 @@ def test_one_warning_names_all_assumed_numbers(can_profile):
     found = by_name(profile_rows(can_profile))["unverified profile values"]
     assert found.verdict is CheckResult.WARNING
     assumed = [key for key, source in can_profile.sources.items() if source == "assumed"]
-    assert found.found == f"{len(assumed)} of {len(can_profile.sources)}"
+    assert found.found == f"{len(assumed)} of {len(can_profile.sources)} assumed"
     assert all(key in found.detail for key in assumed)
     assert "beam.length_m" not in found.detail  # from the paper
 
