@@ -34,7 +34,6 @@ _MAX_META_ENTRIES: Final = 100
 _MAX_COUNT_DIGITS: Final = 18
 """Largest number of digits with which every number is below 2**63."""
 
-"""Mode of a session as in JSON documents."""
 JsonObject = dict[str, Any]
 """JSON object."""
 
