@@ -47,7 +47,7 @@ def main() -> None:
             session_count=2,
             seed=1,
             notes={"specimen": "antenna 3", "operator": "an example"},
-            uses_virtual_clock=True,
+            uses_virtual_clock=True,  # as --fast
             with_live_view=False,
             allows_saturation=False,
             quiet_stdout=True,

@@ -1,7 +1,7 @@
 """The table of workers: each child process of rigd, how it is started, and what its loss entails.
 
-Each row is a `Worker`, which `rigd.engine.processes.ChildProcess` starts. The programs of the
-analyser are named only here, because rigd does not import them.
+Each row is a `Worker`, which `rigd.engine.processes.ChildProcess` starts. What the processes of
+rigd use of the analyser is named here as text, because rigd does not import it.
 """
 
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ CONTROL: Final = Worker(
         "MeasurementRefused",
         "ControlEnded",
     ),
-    consequence="The drive's watchdog switches it off; the session ends as a fault.",
+    consequence="The drive's watchdog switches it off, if it acts; the session ends as a fault.",
     beat=StateField.CONTROL_BEAT,
     max_silence_s=3.0,
     end_timeout_s=5.0,
