@@ -2,14 +2,16 @@
 
 import inspect
 import json
+import re
 import shutil
+from pathlib import Path
 
 import pytest
 from cases import further
 from eds_files import eds_path
 
 from rigd.check_rows import CheckResult, overall_verdict
-from rigd.checks import check_without_devices, run_offline_checks
+from rigd.checks import ACCEPTABLE_ROW_NAMES, check_without_devices, run_offline_checks
 from rigd.control import ControlDesignError
 from rigd.devices import MAY_BE_UNKNOWN, open_devices, unknown_values
 from rigd.devices.contracts import DeviceError
@@ -125,6 +127,12 @@ def test_only_accepted_rows_pass(wrong_value, tmp_path):
     assert "limits.velocity_rad_s" in refusal(
         profile, tmp_path, "chirp", accept=rows, amplitude_rad=0.2
     )
+
+
+def test_every_acceptable_row_is_documented():
+    page = (Path(__file__).parents[2] / "docs" / "check_a_rig.md").read_text("utf-8")
+    table = page.partition("| row | what failed |")[2].partition("\n\n")[0]
+    assert tuple(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == ACCEPTABLE_ROW_NAMES
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones(can_profile):
