@@ -13,6 +13,7 @@ import errno
 import json
 import logging
 import os
+import select
 import socket
 import threading
 import time
@@ -55,6 +56,8 @@ _MAX_UNREAD_BYTES = 262_144
 """Number of bytes of unread output beyond which a client is disconnected."""
 _MAX_WAITING_LINES = 64
 """Number of unprocessed lines beyond which no more are read from a client."""
+_GONE_CHECK_INTERVAL_S = 0.1
+"""Time in seconds between two checks whether a client that sends no more requests still reads."""
 _CLOSE_TIMEOUT_S = 1.0
 """Maximum time in seconds in which a client's last output is sent before it is disconnected."""
 
@@ -390,6 +393,7 @@ class _ClientConnection(asyncio.Protocol):
         """Reply to the pending requests and close, because the client sends no more requests."""
         self._has_ended = True
         self._close_if_done()
+        self._disconnect_if_gone()
         return True
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's
@@ -421,6 +425,18 @@ class _ClientConnection(asyncio.Protocol):
         """Close the connection at once."""
         if self._transport is not None:
             self._transport.abort()
+
+    def _disconnect_if_gone(self) -> None:
+        """Disconnect a client that has died or no longer reads; otherwise check again soon.
+
+        It then loses control, and its requests that wait are not executed.
+        """
+        if self._transport is None or self._transport.is_closing():
+            return
+        if _is_gone(self._transport.get_extra_info("socket")):
+            self.disconnect()
+        else:
+            asyncio.get_running_loop().call_later(_GONE_CHECK_INTERVAL_S, self._disconnect_if_gone)
 
     def _process_next_line(self) -> None:
         """Process one waiting line, and schedule the next."""
@@ -504,6 +520,13 @@ async def _connect(client_socket: socket.socket, client: _ClientConnection) -> N
     except OSError:
         client_socket.close()
         client.connection_lost(None)
+
+
+def _is_gone(client_socket: socket.socket) -> bool:
+    """Return whether the other end is closed, and not only for sending."""
+    poller = select.poll()
+    poller.register(client_socket, 0)  # the kernel reports POLLHUP also if no event is requested
+    return bool(poller.poll(0))
 
 
 _encode_json: Final = json.JSONEncoder(allow_nan=False).encode

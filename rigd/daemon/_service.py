@@ -57,6 +57,9 @@ _RATE_WINDOW_POLLS = 10
 """Number of polls over which message rates are measured."""
 _SHUTTING_DOWN_MESSAGE = "The daemon is being shut down."
 """Reason with which requests are refused while the daemon ends."""
+_STOPPED_MESSAGE = "It was stopped before it began."
+"""Reason with which a command is refused that was stopped, or whose client has gone, before it
+began."""
 _NO_QUICK_LOOK_REASON = "the daemon ended; python -m analysis.quick_look FILE makes it."
 """Reason why there is no quick look that was not complete when the daemon ended."""
 
@@ -232,7 +235,7 @@ class Service:
             self._take_control(peer)
             await self._await_first_connection(peer)
         if isinstance(request, protocol.StartRequest):
-            return await self._start(request)
+            return await self._start(request, peer)
         if isinstance(request, protocol.StopSessionRequest):
             return self.stop(f"stop requested by {peer}")
         if isinstance(request, protocol.CheckRequest):
@@ -334,14 +337,14 @@ class Service:
     async def _await_first_connection(self, peer: Peer) -> None:
         """Wait for the end of the first attempt to connect the rig, if it has not ended yet.
 
-        Raises CommandError if a stop was requested meanwhile.
+        Raises CommandError if a stop was requested, or the client was disconnected, meanwhile.
         """
         if self._current_command != "connecting":
             return
         previous_stop_count = self._stop_count
         await self._first_connection_tried.wait()
         if self._stop_count > previous_stop_count or self.controller != peer:
-            raise CommandError("It was stopped before it began.")
+            raise CommandError(_STOPPED_MESSAGE)
 
     def _require_command_allowed(self, command: str) -> None:
         """Raise CommandError if the state forbids a command, or if the rig is busy."""
@@ -396,8 +399,11 @@ class Service:
         self._last_check = {"utc_ns": time.time_ns(), "verdict": check_reply["verdict"]}
         return check_reply
 
-    async def _start(self, request: protocol.StartRequest) -> Document:
-        """Plan a series of sessions, and start to run it; the reply contains the plan."""
+    async def _start(self, request: protocol.StartRequest, peer: Peer) -> Document:
+        """Plan a series of sessions, and start to run it; the reply contains the plan.
+
+        Raises CommandError if a stop was requested, or the client was disconnected, meanwhile.
+        """
         self._require_command_allowed("start")
         if self._rig.zero_lost:
             raise CommandError(
@@ -417,8 +423,8 @@ class Service:
                 if plan_job.is_heavy
                 else self._call_in_worker(plan_job.perform)
             )
-            if served_series.stop_request.requested or self._is_closing:
-                raise CommandError("It was stopped before it began.")
+            if served_series.stop_request.requested or self._is_closing or self.controller != peer:
+                raise CommandError(_STOPPED_MESSAGE)
             refusal_text = self._state_machine.refusal_text("start")
             if refusal_text:
                 raise CommandError(refusal_text)

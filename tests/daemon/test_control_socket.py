@@ -9,6 +9,7 @@ import os
 import resource
 import socket
 import stat
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 from rigd.daemon import _server as server
-from rigd.daemon import address
+from rigd.daemon import address, background
 from rigd.daemon.address import (
     AddressError,
     UnknownGroupError,
@@ -142,6 +143,54 @@ def test_client_with_closed_write_side_is_answered_and_disconnected(served):
         assert (await link.next())["reply"] == "tare"
         assert await link.next() is None
         assert served.operated.service.controller is None
+
+    served.run(scenario)
+
+
+@pytest.mark.parametrize("leave", ["close", "close after the end of requests"])
+@pytest.mark.parametrize("phase", ["connecting", "planning"])
+def test_start_of_a_client_that_has_gone_moves_nothing(
+    operate, runtime_folder, monkeypatch, phase, leave
+):
+    operated, proceed = operate(), threading.Event()
+    served = Served(operated, socket_path("sim"))
+    if phase == "connecting":
+        operated.world.then = lambda _: proceed.wait(60.0)
+    else:
+        operated.open()
+        perform = background.PlanJob.perform
+        monkeypatch.setattr(
+            background.PlanJob, "perform", lambda job: proceed.wait(60.0) and perform(job)
+        )
+
+    async def scenario(served):
+        if phase == "connecting":
+            opening = asyncio.create_task(operated.service.open())
+            await asyncio.sleep(0)
+        operator, other = await served.connect(), await served.connect()
+        await operator.send(LONG)
+        if leave != "close":
+            operator.writer.write_eof()
+
+        async def status_with(controller):
+            while True:
+                status = await other.request({"command": "status"})
+                if bool(status["controller"]) is controller:
+                    return status
+
+        try:
+            assert (await status_with(controller=True))["doing"] == phase
+            await operator.close()
+            async with asyncio.timeout(30.0):  # which only a failed test takes
+                await status_with(controller=False)
+        finally:
+            proceed.set()
+        if phase == "connecting":
+            await opening
+        while (status := await other.request({"command": "status"}))["doing"]:
+            pass
+        assert (status["state"], status["series"]) == ("ready", None)
+        assert (await other.request({"command": "tare"}))["ok"]
 
     served.run(scenario)
 
