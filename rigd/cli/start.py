@@ -159,16 +159,24 @@ def start_sessions(
             if detach and interrupts.count:
                 client.ask("stop")
                 raise typer.Exit(EXIT_INTERRUPTED)
-            if detach:
-                if as_json:
-                    typer.echo(json.dumps({"series": start_reply["series"]}))
-                else:
-                    _print_plan(start_reply["plan"], to_stderr=False)
+            progress_advice = "rigd status shows the progress, rigd stop ends the session."
+            try:
+                _print_plan(start_reply["plan"], to_stderr=as_json)
+                if detach:
                     typer.echo(
-                        "Running; rigd status shows the progress, rigd stop ends the session."
+                        json.dumps({"series": start_reply["series"]})
+                        if as_json
+                        else f"Running; {progress_advice}"
                     )
+            except OSError as error:  # the sessions run nevertheless
+                if detach:
+                    fail(
+                        f"Running, but the output cannot be written ({error.strerror}); "
+                        f"{progress_advice}",
+                        EXIT_FAILED,
+                    )
+            if detach:
                 return
-            _print_plan(start_reply["plan"], to_stderr=as_json)
             # An older daemon makes no quick looks, or does not report for which sessions.
             makes_quick_looks = daemon_status.get("quick_looks", False)
             series_event = _follow_series(
@@ -279,7 +287,8 @@ def _follow_series(
                     progress_line.close()  # standard output may be the same terminal
                     if daemon_event["path"] is not None:
                         if not as_json:
-                            typer.echo(daemon_event["path"])
+                            with contextlib.suppress(OSError):  # the series continues
+                                typer.echo(daemon_event["path"])
                         if daemon_event.get("look_follows", makes_quick_looks):
                             awaited_quick_looks.add(daemon_event["path"])
                         if "fit" in daemon_event:

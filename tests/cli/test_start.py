@@ -5,8 +5,10 @@ import os
 import signal
 import socket
 import struct
+import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 import typer
@@ -169,12 +171,21 @@ def test_notable_messages_are_printed_and_the_fit_is_returned(follow):
     assert [each.get("fit") for each in ended["sessions"]] == [fit, None]
 
 
+PLAN = {
+    "excitation": "hold", "record_s": 1.2, "peak_angle_rad": 0.0, "peak_velocity_rad_s": 0.0,
+    "peak_torque_nm": 0.0, "warnings": ["A torque will be clipped."],
+}  # fmt: skip
+
+
 @pytest.fixture
-def interrupting_daemon(runtime_folder):
-    """A daemon that leaves a start without reply and sends Ctrl-C; yields received commands."""
+def fake_daemon(runtime_folder):
+    """A daemon that sends events after a start; without events, it sends Ctrl-C, and no reply.
+
+    Yields the received commands and the events.
+    """
     path = socket_path("sim")
     path.parent.mkdir(exist_ok=True)
-    received = []
+    received, events = [], []
     listener = socket.create_server(str(path), family=socket.AF_UNIX)
 
     def serve():
@@ -187,31 +198,61 @@ def interrupting_daemon(runtime_folder):
                 for line in file:
                     command = json.loads(line)["command"]
                     received.append(command)
-                    if command == "start":
+                    if command == "start" and not events:
                         os.kill(process_at(link), signal.SIGINT)
                         continue
                     status = {"daemon": {"what_moves": "No hardware."}, "stopping": False}
-                    file.write(json.dumps({"reply": command, "ok": True, **status}) + "\n")
+                    status |= {"series": 7, "plan": PLAN}
+                    replies = [{"reply": command, "ok": True, **status}]
+                    replies += events if command == "start" else []
+                    file.writelines(json.dumps(reply) + "\n" for reply in replies)
                     file.flush()
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
-    yield received
+    yield received, events
     listener.shutdown(socket.SHUT_RDWR)  # which wakes the thread
     thread.join(10.0)
     listener.close()
 
 
-@pytest.mark.process
-@pytest.mark.parametrize("options", [(), further(("--detach",))])
-def test_ctrl_c_cancels_a_waiting_start(interrupting_daemon, options):
-    completed = warm_start.run(
+def start_hold(*options, stdout=subprocess.PIPE):
+    return warm_start.run(
         [sys.executable, "-m", "rigd", "start", "hold", "--profile", "sim", *options],
-        check=False,
-        capture_output=True,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
         text=True,
         timeout=50.0,
     )
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("options", [(), further(("--detach",))])
+def test_ctrl_c_cancels_a_waiting_start(fake_daemon, options):
+    received, _ = fake_daemon
+    completed = start_hold(*options)
     assert (completed.returncode, completed.stdout) == (130, "")
     assert completed.stderr == "No hardware.\nStopped before the session began.\n"
-    assert interrupting_daemon[-2:] == ["start", "stop"]
+    assert received[-2:] == ["start", "stop"]
+
+
+@pytest.mark.process
+def test_series_is_followed_although_the_output_cannot_be_written(fake_daemon):
+    _, events = fake_daemon
+    events += [session(1), session(2), series(1, 2) | {"failed": False, "stopped": False}]
+    with Path("/dev/full").open("w") as full:
+        completed = start_hold(stdout=full)
+        assert completed.returncode == 0
+        assert completed.stderr.count("Complete: 1200 of 1200 samples") == 2
+        completed = start_hold("--detach", stdout=full)
+    assert completed.returncode == 1
+    assert "Error: Running, but the output cannot be written" in completed.stderr
+
+
+@pytest.mark.process
+def test_detached_start_with_json_shows_the_warnings_of_the_plan(fake_daemon):
+    _, events = fake_daemon
+    events.append(series() | {"failed": False, "stopped": False})
+    completed = start_hold("--detach", "--json")
+    assert json.loads(completed.stdout) == {"series": 7}
+    assert "Warning: A torque will be clipped.\n" in completed.stderr
