@@ -1,6 +1,5 @@
 """Client of the fit process, which fits the record during a session."""
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,7 +11,7 @@ from rigd.engine.messages import (
     RecordEnded,
     SearchEnded,
 )
-from rigd.engine.shared_state import LogEvent, StateField, StopReason
+from rigd.engine.shared_state import LogEvent, StateField
 from rigd.engine.workers import FIT
 from rigd.runner._precision_search import (
     TargetEstimate,
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
 
 _FINAL_FIT_TIMEOUT_S: Final = 60.0
 """Maximum time in seconds to wait for the fit of the whole record after the session."""
-_STOPPED_FIT_TIMEOUT_S: Final = 5.0
-"""Maximum time in seconds to wait for the fit of the whole record if a stop is requested."""
 _STORED_FIT_KEYS: Final = (
     "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
     "modes", "parameters",
@@ -66,7 +63,6 @@ class FitClient(WorkerClient):
         self._last_report: FitReport | None = None
         self._search_end: SearchEnded | None = None
         self._has_begun = False
-        self._skip_reason = ""
         self.segments: Mapping[str, tuple[int, int]] = {}
         self.unmet_reason = ""
         first_sample_position = group.channels.samples.written_count
@@ -93,20 +89,8 @@ class FitClient(WorkerClient):
         meanwhile.
         """
         self._send(RecordEnded(record_ticks))
-        stop_deadline_s = time.monotonic() + _STOPPED_FIT_TIMEOUT_S
-
-        def is_worth_waiting() -> bool:
-            call_while_waiting()
-            if (
-                self._shared_state[StateField.STOP_REASON] == StopReason.NONE
-                or time.monotonic() <= stop_deadline_s
-            ):
-                return True
-            self._skip_reason = "A stop skipped the fit of the whole record."
-            return False
-
-        if self._has_begun and not self._wait(
-            lambda: self._is_done, _FINAL_FIT_TIMEOUT_S, is_worth_waiting
+        if self._has_begun and not self._await_results(
+            lambda: self._is_done, _FINAL_FIT_TIMEOUT_S, call_while_waiting
         ):
             self._give_up("The fit of the whole record took too long.")
         last_estimate = {} if self._last_report is None else self._last_report.document
@@ -148,7 +132,11 @@ class FitClient(WorkerClient):
         was_reached_before = search_end is not None and search_end.reached
         unknown_reason = "" if report is None else str(report.document.get("problem") or "")
         if report is None or not report.final:
-            unknown_reason = self.failure or self._skip_reason or "The whole record was not fitted."
+            unknown_reason = self.failure or (
+                "A stop skipped the fit of the whole record."
+                if self._has_begun
+                else "The whole record was not fitted."
+            )
         elif not unknown_reason and not estimates:
             unknown_reason = "Its fit has no modes."
         if unknown_reason:

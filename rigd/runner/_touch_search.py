@@ -4,6 +4,7 @@ The control loop detects a touch and reacts to it. Meanwhile the touch process e
 and force. If the touch process fails, the session continues without estimates.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
@@ -31,6 +32,8 @@ _ROUNDING_STD_PER_STEP: Final = 1 / sqrt(12)
 _FINAL_ESTIMATES_TIMEOUT_S: Final = 120.0
 """Maximum time in seconds to wait for the final estimates after the end of a record. They take
 seconds, but more than half a minute if five programs compete for each processor."""
+_WAIT_ANNOUNCED_AFTER_S: Final = 2.0
+"""Time in seconds after which the wait for the final estimates is announced."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,14 +153,27 @@ class TouchClient(WorkerClient):
 
         `touch_count` is the number of detected touches. The dictionary of a touch without an
         estimate contains its number only. If only the less accurate first estimate is known,
-        ``final`` is False.
+        ``final`` is False. `call_while_waiting` is called repeatedly meanwhile.
         """
+        announce_time_s = time.monotonic() + _WAIT_ANNOUNCED_AFTER_S
+        is_announced = False
 
         def are_touches_final() -> bool:
             final_count = sum(touch_report.final for touch_report in self._reports.values())
             return final_count >= touch_count
 
-        self._wait(are_touches_final, _FINAL_ESTIMATES_TIMEOUT_S, call_while_waiting)
+        def announce_and_report() -> None:
+            nonlocal is_announced
+            if (
+                not (is_announced or self._is_stop_requested)
+                and time.monotonic() >= announce_time_s
+            ):
+                is_announced = True
+                wait_text = "Waiting for the estimates of the touches; a stop skips them."
+                self._events.append(LogEvent(0, "info", wait_text, notable=True))
+            call_while_waiting()
+
+        self._await_results(are_touches_final, _FINAL_ESTIMATES_TIMEOUT_S, announce_and_report)
         return [
             _touch_document(touch_number, self._reports.get(touch_number))
             for touch_number in range(1, touch_count + 1)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 from rigd.engine.messages import ProcessFailed
 from rigd.engine.processes import ChildError
-from rigd.engine.shared_state import Level, LogEvent
+from rigd.engine.shared_state import Level, LogEvent, StateField, StopReason
 
 if TYPE_CHECKING:
     from rigd.engine.workers import Worker
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 _POLL_INTERVAL_S: Final = 0.05
 """Maximum time in seconds of a single wait for a message."""
+_STOPPED_RESULTS_TIMEOUT_S: Final = 5.0
+"""Maximum time in seconds to wait for the results after the record if a stop is requested."""
 
 
 class WorkerClient(ABC):
@@ -126,6 +128,27 @@ class WorkerClient(ABC):
             if time.monotonic() > deadline_s:
                 return is_condition_met() or bool(self.failure)
         return True
+
+    def _await_results(
+        self,
+        are_complete: Callable[[], bool],
+        timeout_s: float,
+        call_while_waiting: Callable[[], None],
+    ) -> bool:
+        """Wait for the results after the record, after a stop for 5 s only; False on a timeout."""
+        stop_deadline_s = time.monotonic() + _STOPPED_RESULTS_TIMEOUT_S
+
+        def is_worth_waiting() -> bool:
+            call_while_waiting()
+            return not self._is_stop_requested or time.monotonic() <= stop_deadline_s
+
+        return self._wait(are_complete, timeout_s, is_worth_waiting)
+
+    @property
+    def _is_stop_requested(self) -> bool:
+        """Whether a stop of the session is requested."""
+        shared_state = self._group.channels.shared_state
+        return shared_state[StateField.STOP_REASON] != StopReason.NONE
 
     def _restart_or_give_up(self, reason: str) -> None:
         """Restart the lost process, or give it up if its number of restarts is used up."""

@@ -74,7 +74,7 @@ NOT_A_NUMBER = fit_of_record(float("nan"))
 def test_result_is_unknown_without_a_fit_of_the_record(
     messages, state, reached, words, monkeypatch
 ):
-    monkeypatch.setattr("rigd.runner._online_fit._STOPPED_FIT_TIMEOUT_S", 0.0)
+    monkeypatch.setattr("rigd.runner._worker_client._STOPPED_RESULTS_TIMEOUT_S", 0.0)
     group = MagicMock()
     group.channels.shared_state.__getitem__.side_effect = lambda word: state.get(word, 0)
 
