@@ -324,7 +324,7 @@ def progress_document(status: RigStatus, record_ticks: int, rate_hz: float | Non
     `record_ticks` is the number of ticks of the record. `rate_hz` is the sample rate, or None
     under the virtual clock, for which no remaining time is stated.
     """
-    # Before tick 0 the status may have the counts of the previous session.
+    # A status that was read just before the session has the counts of the previous session.
     remaining_ticks = max(0, record_ticks - status.tick)
     return {
         "phase": status.phase.name.lower(),

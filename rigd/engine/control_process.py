@@ -290,20 +290,6 @@ class _ControlServer:
         Raise `DeviceError` if a device failed. `SessionFinished` has been sent nevertheless.
         """
         shared_state, devices = self._shared_state, self._devices
-        for state_field in (
-            StateField.START_UTC_NS,
-            StateField.SCHEDULED_TICKS,
-            StateField.MISSED_TICKS,
-            StateField.LATE_TICKS,
-            StateField.LOST_SAMPLES,
-            StateField.STALE_ANGLES,
-            StateField.STALE_WRENCHES,
-            StateField.TOUCHES,
-            StateField.HELD_TICKS,
-            StateField.HELD_TICKS_BEFORE_SEGMENT,
-            StateField.BEGUN_REFERENCE_TICKS,
-        ):
-            shared_state[state_field] = 0
         self._warn_of_refusals(session_job)
         self._log_accepted_checks(session_job)
         cycle = self._cycle = self._make_cycle(session_job.profile)

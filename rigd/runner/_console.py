@@ -116,7 +116,7 @@ class ProgressLine:
         session_number_text
             Number of the session in its series, such as ``2/5``; empty for a single session.
         """
-        # Before tick 0 the counter still has the value of the previous session.
+        # A daemon's first event may have the counter of the previous session.
         self._has_record_begun |= phase is Phase.RUNNING
         self._state = {
             "description": f"{phase.display_text} {session_number_text}".rstrip(),

@@ -522,12 +522,29 @@ def _do_nothing_on_stop() -> None:
 
 
 def _reset_session_fields(shared_state: SharedState) -> None:
-    """Reset the fields of the shared state that belong to a single session."""
+    """Reset the fields of the shared state that belong to a single session.
+
+    The control process, which writes the counts of the record, must be idle.
+    """
     shared_state[StateField.STOP_REASON] = StopReason.NONE
-    shared_state[StateField.RECORD_MAY_START] = 0
-    shared_state[StateField.LIVE_SAMPLES_DROPPED] = 0
-    shared_state[StateField.PLANNED_TICKS] = 0
-    shared_state[StateField.LAST_SEGMENT] = 0
+    for state_field in (
+        StateField.RECORD_MAY_START,
+        StateField.START_UTC_NS,
+        StateField.SCHEDULED_TICKS,
+        StateField.MISSED_TICKS,
+        StateField.LATE_TICKS,
+        StateField.LOST_SAMPLES,
+        StateField.LIVE_SAMPLES_DROPPED,
+        StateField.STALE_ANGLES,
+        StateField.STALE_WRENCHES,
+        StateField.TOUCHES,
+        StateField.HELD_TICKS,
+        StateField.HELD_TICKS_BEFORE_SEGMENT,
+        StateField.BEGUN_REFERENCE_TICKS,
+        StateField.PLANNED_TICKS,
+        StateField.LAST_SEGMENT,
+    ):
+        shared_state[state_field] = 0
 
 
 def _allocate_shared_memory(

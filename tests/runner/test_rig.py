@@ -99,6 +99,14 @@ def test_tare_and_zero_between_sessions(rig, run):
 
 
 @pytest.mark.further  # as in the service
+def test_progress_of_a_session_begins_at_zero(rig, run):
+    run(rig)
+    ticks = []
+    run(rig, listener=lambda progress, _: ticks.append(progress.tick))
+    assert ticks == sorted(ticks)
+    assert ticks[0] == 0
+
+
 def test_zero_is_lost_with_the_connection(rig, run):
     rig.zero()
     rig.disconnect()
