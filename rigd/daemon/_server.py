@@ -33,7 +33,7 @@ from rigd.daemon._protocol import (
     WatchRequest,
     parse_request,
 )
-from rigd.daemon._service import Service
+from rigd.daemon._service import SHUTTING_DOWN_MESSAGE, Service
 from rigd.daemon._states import Document, Peer, resolve_user
 from rigd.daemon.address import peer_pid_and_uid
 
@@ -98,7 +98,10 @@ class Server:
             client.write(event_line)
 
     async def close(self) -> None:
-        """Stop accepting clients, send the pending output, and close all connections."""
+        """Stop accepting clients, send the pending output, and close all connections.
+
+        The service has ended, so that the requests that still wait for a reply are refused.
+        """
         self._closed = True
         asyncio.get_running_loop().remove_reader(self._listener)
         self._listener.close()
@@ -106,6 +109,7 @@ class Server:
             self._forget_pending(pending_connection)
             pending_connection.client_socket.close()
         for client in list(self._clients):
+            client.refuse_pending_requests()
             self._disconnect_when_sent(client)
         while self._leaving_clients:  # takes at most `_CLOSE_TIMEOUT_S`
             await asyncio.sleep(0.01)
@@ -330,7 +334,8 @@ class _ClientConnection(asyncio.Protocol):
         self._pending = bytearray()
         self._waiting_lines: deque[bytes] = deque()
         self._next_line_timer: asyncio.TimerHandle | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._requests: dict[asyncio.Task[None], AnyRequest] = {}
+        """Task of a request that awaits its reply → the request."""
         self._has_ended = False
         self._is_leaving = False
         self.connecting: asyncio.Task[None] | None = None
@@ -344,7 +349,7 @@ class _ClientConnection(asyncio.Protocol):
         return not (
             self._received_bytes
             or self.is_subscribed
-            or self._tasks
+            or self._requests
             or self._waiting_lines
             or self._service.controller == self._peer
         )
@@ -413,6 +418,15 @@ class _ClientConnection(asyncio.Protocol):
         if self._transport.get_write_buffer_size() > _MAX_UNREAD_BYTES:
             self.disconnect()
 
+    def refuse_pending_requests(self) -> None:
+        """Refuse the requests that wait for a reply, because the daemon ends."""
+        for task, request in self._requests.items():
+            if not task.done():  # otherwise it has sent its reply
+                refusal_document = _refusal_document(
+                    request.id, SHUTTING_DOWN_MESSAGE, command=request.command, wrong_use=False
+                )
+                self.write(_json_line(refusal_document))
+
     def close_when_sent(self) -> None:
         """Close the connection when all output is sent, or after a second."""
         self._is_leaving = True
@@ -479,7 +493,7 @@ class _ClientConnection(asyncio.Protocol):
         if isinstance(request, WatchRequest):
             self._is_subscribed_to_signals |= request.signals
         reply_task = asyncio.create_task(self._execute_and_reply(request))
-        self._tasks.add(reply_task)
+        self._requests[reply_task] = request
         reply_task.add_done_callback(self._remove_task)
 
     async def _execute_and_reply(self, request: AnyRequest) -> None:
@@ -488,12 +502,12 @@ class _ClientConnection(asyncio.Protocol):
 
     def _remove_task(self, task: "asyncio.Task[None]") -> None:
         """Remove the task of a request after the reply was sent."""
-        self._tasks.discard(task)
+        self._requests.pop(task, None)
         self._close_if_done()
 
     def _close_if_done(self) -> None:
         """Close the connection if the client sends no more requests and has all replies."""
-        if self._has_ended and not (self._tasks or self._waiting_lines):
+        if self._has_ended and not (self._requests or self._waiting_lines):
             self.close_when_sent()
 
 

@@ -55,7 +55,7 @@ _UNRESPONSIVE_AFTER_S = 1.5
 """Time in seconds without a poll after which the event loop is assumed to receive no stop."""
 _RATE_WINDOW_POLLS = 10
 """Number of polls over which message rates are measured."""
-_SHUTTING_DOWN_MESSAGE = "The daemon is being shut down."
+SHUTTING_DOWN_MESSAGE = "The daemon is being shut down."
 """Reason with which requests are refused while the daemon ends."""
 _STOPPED_MESSAGE = "It was stopped before it began."
 """Reason with which a command is refused that was stopped, or whose client has gone, before it
@@ -349,7 +349,7 @@ class Service:
     def _require_command_allowed(self, command: str) -> None:
         """Raise CommandError if the state forbids a command, or if the rig is busy."""
         if self._is_closing:
-            raise CommandError(_SHUTTING_DOWN_MESSAGE)
+            raise CommandError(SHUTTING_DOWN_MESSAGE)
         refusal_text = self._state_machine.refusal_text(command)
         if refusal_text:
             raise CommandError(refusal_text)
@@ -470,7 +470,7 @@ class Service:
                     self._state_machine.change_to(DaemonState.READY, "reset by the operator")
                     return {"zero_lost": self._rig.zero_lost}
             if self._is_closing:
-                raise CommandError(_SHUTTING_DOWN_MESSAGE)
+                raise CommandError(SHUTTING_DOWN_MESSAGE)
             fault_reason = self._fault_reason
             self._state_machine.change_to(DaemonState.IDLE, "reset by the operator")
             await self._connect(reset_fault=True, earlier_fault=fault_reason)
@@ -505,7 +505,7 @@ class Service:
             raise CommandError(failure_reason) from None
         if self._is_closing:
             await self._call_in_worker(self._rig.disconnect)
-            raise CommandError(_SHUTTING_DOWN_MESSAGE)
+            raise CommandError(SHUTTING_DOWN_MESSAGE)
         self._state_machine.change_to(DaemonState.READY, f"{actuation_target.value} is connected")
 
     def _enter_fault(self, reason: str, earlier_fault: str) -> None:

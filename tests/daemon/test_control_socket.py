@@ -195,6 +195,29 @@ def test_start_of_a_client_that_has_gone_moves_nothing(
     served.run(scenario)
 
 
+def test_start_is_refused_if_the_daemon_ends_during_the_planning(served, monkeypatch):
+    planning, replies = asyncio.Event(), []
+
+    async def plan(job):
+        await planning.wait()
+
+    monkeypatch.setattr(background, "perform", plan)
+    monkeypatch.setattr(background.PlanJob, "is_heavy", True)
+
+    async def scenario(served):
+        operator = await served.connect()
+        await operator.send(LONG | {"id": 5})
+        while served.operated.service.status()["doing"] != "planning":
+            await asyncio.sleep(0.001)
+        replies.append(asyncio.create_task(operator.next()))
+
+    served.run(scenario)
+    planning.set()
+    reply = served.operated.loop.run_until_complete(replies[0])
+    assert (reply["reply"], reply["ok"], reply["id"]) == ("start", False, 5)
+    assert "shut down" in reply["error"]
+
+
 def test_misbehaving_clients_do_not_harm_a_running_session(served, monkeypatch):
     monkeypatch.setattr(server, "_MAX_UNREAD_BYTES", 65_536)
 
