@@ -192,6 +192,9 @@ def start_sessions(
         print_error(series_event["reason"])
         raise typer.Exit(EXIT_FAILED)
     if series_event["stopped"]:
+        sessions = series_event["sessions"]
+        if series_event["reason"] and not (sessions and sessions[-1]["reason"]):
+            typer.echo(series_event["reason"], err=True)
         raise typer.Exit(EXIT_INTERRUPTED)
 
 

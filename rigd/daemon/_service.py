@@ -547,10 +547,17 @@ class Service:
             await self._disconnect_safely()
         else:
             last_result = series.session_results[-1] if series.session_results else None
+            session_count = len(series.session_results)
             if last_result is not None and not last_result.is_successful:
                 series.end_reason = last_result.reason
                 if last_result.fault:
                     fault_reason = last_result.reason
+            elif series.stop_request.requested and session_count < series.request.repeat:
+                series.end_reason = (
+                    f"Stopped after {session_count} of {series.request.repeat} sessions."
+                    if session_count
+                    else _STOPPED_MESSAGE
+                )
         if not self._rig.connected:
             fault_reason = (
                 fault_reason or series.end_reason or "The connection to the devices is lost."

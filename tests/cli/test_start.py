@@ -256,3 +256,13 @@ def test_detached_start_with_json_shows_the_warnings_of_the_plan(fake_daemon):
     completed = start_hold("--detach", "--json")
     assert json.loads(completed.stdout) == {"series": 7}
     assert "Warning: A torque will be clipped.\n" in completed.stderr
+
+
+@pytest.mark.process
+def test_series_that_was_stopped_between_two_sessions(fake_daemon):
+    _, events = fake_daemon
+    reason = "Stopped after 1 of 3 sessions."
+    events += [session(1), series(1) | {"failed": False, "stopped": True, "reason": reason}]
+    completed = start_hold("--repeat", "3")
+    assert completed.returncode == 130
+    assert completed.stderr.endswith(f"\n{reason}\n")

@@ -139,6 +139,21 @@ def test_any_client_can_stop_the_series(operated):
     assert operated.request("stop", peer=OTHER) == {"stopping": False}
 
 
+def test_stop_between_two_sessions_is_stated(operated, monkeypatch):
+    run = operated.rig.run
+
+    def run_and_stop(*arguments):
+        result = run(*arguments)
+        operated.service.stop("stop requested by a test")
+        return result
+
+    monkeypatch.setattr(operated.rig, "run", run_and_stop)
+    operated.request("start", **SHORT, repeat=3)
+    assert [session["outcome"] for session in operated.last["sessions"]] == ["complete"]
+    assert operated.last["reason"] == "Stopped after 1 of 3 sessions."
+    assert (operated.last["failed"], operated.state) == (False, "ready")
+
+
 def test_commands_not_allowed_in_a_state_are_refused(operated):
     refused = []
 
