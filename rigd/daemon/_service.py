@@ -536,9 +536,10 @@ class Service:
             )
         except (UserError, RigError, ProbeFailedError, SessionFailedError) as error:
             series.end_reason = str(error)
+            if isinstance(error, SessionFailedError):
+                series.end_reason = f"{error} {remaining_file_text(error.path)}"
             if not error.wrong_use:
-                session_path = error.path if isinstance(error, SessionFailedError) else None
-                fault_reason = series.end_reason = f"{error} {remaining_file_text(session_path)}"
+                fault_reason = series.end_reason
         except Exception as error:
             # After an unexpected error the rig is disconnected, because nothing else may switch it
             # off.

@@ -324,6 +324,26 @@ def test_reset_does_not_replace_simulation_by_hardware(operated):
     assert len(operated.world.drives) == 1
 
 
+def test_death_of_control_process_between_two_sessions_reports_no_missing_file(
+    operated, monkeypatch
+):
+    run, results = operated.rig.run, []
+
+    def run_once(*arguments):
+        if results:
+            operated.rig._group.control.kill()
+            operated.rig.check_control_process()
+        results.append(run(*arguments))
+        return results[-1]
+
+    monkeypatch.setattr(operated.rig, "run", run_once)
+    operated.request("start", **SHORT, repeat=2)
+    assert [session["outcome"] for session in operated.last["sessions"]] == ["complete"]
+    assert operated.last["failed"]
+    assert "was killed" in operated.last["reason"]
+    assert "file" not in operated.last["reason"]
+
+
 def test_death_of_control_process_between_sessions_is_a_fault(operated):
     operated.rig._group.control.kill()
     for _ in range(100):
