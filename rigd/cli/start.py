@@ -233,6 +233,7 @@ def _follow_series(
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
     from rigd.runner.quick_looks import QuickLook
+    from rigd.session.quick_look import quick_look_path
 
     is_stop_sent = False
     ended_session_count = 0
@@ -260,7 +261,7 @@ def _follow_series(
                 if final_event is None:
                     raise
                 # The sessions have ended, and their results are known.
-                progress_line.write_message("No quick look: the daemon has ended.")
+                progress_line.write_message("No quick look: the connection to the daemon is lost.")
                 break
             match daemon_event.get("event"):
                 # No bar between two sessions, where it would mix with the printed path.
@@ -309,6 +310,12 @@ def _follow_series(
                     deadline_s = time.monotonic() + _QUICK_LOOK_TIMEOUT_S
                     if awaited_quick_looks:
                         progress_line.write_message("Quick look at the session; Ctrl-C skips it.")
+        else:
+            for session_path in sorted(awaited_quick_looks):
+                progress_line.write_message(
+                    "No quick look yet: the daemon still makes it; it will be "
+                    f"{quick_look_path(Path(session_path))}."
+                )
     finally:
         progress_line.close()
     session_results = [

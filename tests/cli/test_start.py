@@ -140,11 +140,20 @@ def test_ctrl_c_skips_the_quick_look(follow, interrupts):
     assert sent == ["stop"] * len(interrupts)
 
 
+def test_quick_look_that_takes_long_is_announced(follow, monkeypatch):
+    monkeypatch.setattr(start, "_QUICK_LOOK_TIMEOUT_S", 0.0)
+    ended, calls, _ = follow(session(1), session(2), quick_look(1), series(1, 2))
+    assert ended["sessions"][1]["look"] is None
+    announcement = "No quick look yet: the daemon still makes it; it will be out/2.look.json."
+    assert [each[1] for each in calls if each[0] == "write_message"][-1] == announcement
+    assert len([each for each in calls if "No quick look" in each[-1]]) == 1
+
+
 def test_quick_look_that_ends_with_the_daemon(follow):
     lost = DaemonUnreachableError("The connection to the daemon is lost.")
     ended, calls, _ = follow(session(1), series(1), lost)
     assert ended["sessions"][0]["look"] is None
-    assert ("write_message", "No quick look: the daemon has ended.") in calls
+    assert ("write_message", "No quick look: the connection to the daemon is lost.") in calls
     with pytest.raises(DaemonUnreachableError):
         follow(session(1), lost)
 
