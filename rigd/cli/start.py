@@ -32,6 +32,7 @@ from rigd.cli.options import (
     print_error,
     session_notes,
 )
+from rigd.errors import RigdError
 
 if TYPE_CHECKING:
     from rigd.daemon.client import Client
@@ -155,6 +156,8 @@ def start_sessions(
             )
             if start_reply["reply"] == "stop":
                 typer.echo("Stopped before the session began.", err=True)
+                if as_json and not detach:
+                    _write_json([])
                 raise typer.Exit(EXIT_INTERRUPTED)
             if detach and interrupts.count:
                 client.ask("stop")
@@ -179,21 +182,28 @@ def start_sessions(
                 return
             # An older daemon makes no quick looks, or does not report for which sessions.
             makes_quick_looks = daemon_status.get("quick_looks", False)
-            series_event = _follow_series(
-                client,
-                start_reply["series"],
-                interrupts,
-                as_json=as_json,
-                makes_quick_looks=makes_quick_looks,
-            )
+            session_results: list[dict[str, Any]] = []
+            try:
+                series_event = _follow_series(
+                    client,
+                    start_reply["series"],
+                    interrupts,
+                    session_results,
+                    as_json=as_json,
+                    makes_quick_looks=makes_quick_looks,
+                )
+            except (typer.Exit, RigdError):
+                if as_json:
+                    with contextlib.suppress(OSError):  # the exception has precedence
+                        _write_json(session_results)
+                raise
     if as_json:
-        typer.echo(json.dumps({"sessions": series_event["sessions"]}))
+        _write_json(session_results)
     if series_event["failed"]:
         print_error(series_event["reason"])
         raise typer.Exit(EXIT_FAILED)
     if series_event["stopped"]:
-        sessions = series_event["sessions"]
-        if series_event["reason"] and not (sessions and sessions[-1]["reason"]):
+        if series_event["reason"] and not (session_results and session_results[-1]["reason"]):
             typer.echo(series_event["reason"], err=True)
         raise typer.Exit(EXIT_INTERRUPTED)
 
@@ -224,11 +234,15 @@ def _follow_series(
     client: "Client",
     series_number: int,
     interrupts: _InterruptCounter,
+    session_results: list[dict[str, Any]],
     *,
     as_json: bool,
     makes_quick_looks: bool,
 ) -> dict[str, Any]:
-    """Show the progress of a series of sessions until its end, and return its final event."""
+    """Show the progress of a series of sessions until its end, and return its final event.
+
+    The result of each session is appended to `session_results` when the session has ended.
+    """
     from rigd.daemon.client import DaemonUnreachableError
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
@@ -238,8 +252,6 @@ def _follow_series(
     is_stop_sent = False
     ended_session_count = 0
     awaited_quick_looks: set[str] = set()
-    quick_look_paths: dict[str, str] = {}
-    fits_by_path: dict[str, Any] = {}
     final_event: dict[str, Any] | None = None
     interrupts_at_end, deadline_s = 0, 0.0
     progress_line = ProgressLine()
@@ -287,6 +299,14 @@ def _follow_series(
                 ):
                     progress_line.write_message(daemon_event["text"])
                 case "session":
+                    session_results.append(
+                        {"look": None}
+                        | {
+                            key: value
+                            for key, value in daemon_event.items()
+                            if key not in ("event", "number", "look_follows")
+                        }
+                    )
                     progress_line.write_message(result_line(daemon_event))
                     progress_line.close()  # standard output may be the same terminal
                     if daemon_event["path"] is not None:
@@ -295,14 +315,13 @@ def _follow_series(
                                 typer.echo(daemon_event["path"])
                         if daemon_event.get("look_follows", makes_quick_looks):
                             awaited_quick_looks.add(daemon_event["path"])
-                        if "fit" in daemon_event:
-                            fits_by_path[daemon_event["path"]] = daemon_event["fit"]
                     progress_line, ended_session_count = ProgressLine(), daemon_event["number"]
                 case "quick_look" if daemon_event["path"] in awaited_quick_looks:
                     awaited_quick_looks.discard(daemon_event["path"])
                     quick_look = QuickLook.from_event(daemon_event)
-                    if quick_look.path is not None:
-                        quick_look_paths[daemon_event["path"]] = str(quick_look.path)
+                    for session_result in session_results:
+                        if session_result["path"] == daemon_event["path"] and quick_look.path:
+                            session_result["look"] = str(quick_look.path)
                     for log_text in quick_look.lines:
                         progress_line.write_message(log_text)
                 case "series" if daemon_event["series"] == series_number:
@@ -318,17 +337,12 @@ def _follow_series(
                 )
     finally:
         progress_line.close()
-    session_results = [
-        session_entry
-        | {"look": quick_look_paths.get(session_entry["path"])}
-        | (
-            {"fit": fits_by_path[session_entry["path"]]}
-            if session_entry["path"] in fits_by_path
-            else {}
-        )
-        for session_entry in final_event["sessions"]
-    ]
-    return final_event | {"sessions": session_results}
+    return final_event
+
+
+def _write_json(session_results: list[dict[str, Any]]) -> None:
+    """Write the results of the sessions to standard output as JSON."""
+    typer.echo(json.dumps({"sessions": session_results}))
 
 
 def _print_plan(plan: dict[str, Any], *, to_stderr: bool) -> None:

@@ -1,5 +1,6 @@
 """`rigd start` follows a series, by the events of a fake daemon."""
 
+import contextlib
 import json
 import os
 import signal
@@ -37,15 +38,16 @@ class Client:
     An error among them is raised.
     """
 
-    def __init__(self, interrupts, *events):
-        self.interrupts = interrupts
+    def __init__(self, press, *events):
+        self.press = press
         self.events = list(events)
         self.sent = []
 
     def next_event(self, _timeout_s):
         event = self.events.pop(0) if self.events else None
         if isinstance(event, int):
-            self.interrupts.count += event
+            for _ in range(event):
+                self.press()
             return None
         if isinstance(event, Exception):
             raise event
@@ -71,11 +73,11 @@ def follow(monkeypatch):
 
         monkeypatch.setattr("rigd.runner.ProgressLine", Line)
         interrupts = start._InterruptCounter()
-        client = Client(interrupts, *events)
+        client, results = Client(interrupts.add_press, *events), []
         try:
             ended = start._follow_series(
-                client, 7, interrupts, as_json=True, makes_quick_looks=quick_looks
-            )
+                client, 7, interrupts, results, as_json=True, makes_quick_looks=quick_looks
+            ) | {"sessions": results}
         except typer.Exit as ending:
             ended = ending.exit_code
         return ended, calls, client.sent
@@ -163,6 +165,21 @@ def test_second_ctrl_c_leaves_the_session_to_the_daemon(follow):
     assert (ended, sent) == (130, ["stop"])
 
 
+@pytest.mark.parametrize(
+    ("ending", "code"),
+    [((2,), 130), ((DaemonUnreachableError("The connection to the daemon is lost."),), 1)],
+)
+def test_json_has_the_sessions_before_an_early_end(rigd_here, monkeypatch, ending, code):
+    client = Client(lambda: signal.raise_signal(signal.SIGINT), session(1), *ending)
+    client.ask = lambda _: {"daemon": {"what_moves": "No hardware."}}
+    client.request_unless_stopped = lambda *_, **__: {"reply": "start", "series": 7, "plan": PLAN}
+    monkeypatch.setattr(start, "daemon_client", lambda _: contextlib.nullcontext(client))
+    done = rigd_here("start", "hold", "--repeat", "3", "--json")
+    assert done.returncode == code
+    (result,) = json.loads(done.stdout)["sessions"]
+    assert (result["path"], result["outcome"], result["look"]) == ("out/1.mcap", "complete", None)
+
+
 def test_notable_messages_are_printed_and_the_fit_is_returned(follow):
     events = [
         {"event": "message", "level": "info", "text": text, "notable": notable}
@@ -236,11 +253,13 @@ def start_hold(*options, stdout=subprocess.PIPE):
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("options", [(), further(("--detach",))])
-def test_ctrl_c_cancels_a_waiting_start(fake_daemon, options):
+@pytest.mark.parametrize(
+    ("options", "output"), [(("--json",), '{"sessions": []}\n'), further(("--detach",), "")]
+)
+def test_ctrl_c_cancels_a_waiting_start(fake_daemon, options, output):
     received, _ = fake_daemon
     completed = start_hold(*options)
-    assert (completed.returncode, completed.stdout) == (130, "")
+    assert (completed.returncode, completed.stdout) == (130, output)
     assert completed.stderr == "No hardware.\nStopped before the session began.\n"
     assert received[-2:] == ["start", "stop"]
 
