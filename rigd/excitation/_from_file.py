@@ -1,5 +1,6 @@
 """Reference signals from text files."""
 
+from math import isclose
 from pathlib import Path
 from typing import Annotated, BinaryIO, Final
 
@@ -29,6 +30,8 @@ ANGLE_COLUMN: Final = "angle_rad"
 """Heading of the column of angles."""
 _RADIAN_NAMES: Final = ("rad", "radian", "radians")
 """Names of the unit that a column of angles may state."""
+_RATE_TOLERANCE: Final = 2e-5
+"""Largest relative difference between the rate that a file states and the rate of the session."""
 
 
 @documented
@@ -58,7 +61,7 @@ def from_csv(
         If the file cannot be read, or a line of it is invalid.
     """
     path = Path(path)
-    times_s, angles_rad = _read_columns(path)
+    times_s, angles_rad = _read_columns(path, rate_hz)
     if times_s is None:
         tick_count = len(angles_rad)
         sweep_rad = angles_rad
@@ -82,7 +85,7 @@ def from_csv(
 
 
 def _read_columns(
-    path: Path,
+    path: Path, rate_hz: float
 ) -> tuple[npt.NDArray[np.float64] | None, npt.NDArray[np.float64]]:
     """Read times in s and angles in rad; the times are None if the file has one angle a tick."""
     try:
@@ -112,6 +115,16 @@ def _read_columns(
     if time_column is not None and time_column.unit and time_unit_s(time_column.unit) != 1.0:
         raise ExcitationError(
             f"{path}: states another unit than s for {TIME_COLUMN}; write seconds."
+        )
+    file_rate_hz = angle_column.rate_hz
+    if (
+        time_column is None
+        and file_rate_hz is not None
+        and not isclose(file_rate_hz, rate_hz, rel_tol=_RATE_TOLERANCE)
+    ):
+        raise ExcitationError(
+            f"{path}: states {file_rate_hz:.6g} Hz above its angles, and the reference is played "
+            f"at {rate_hz:.6g} Hz, one angle a tick; add a column {TIME_COLUMN}, or resample it."
         )
     for column_name, column_values in ((ANGLE_COLUMN, angle_column), (TIME_COLUMN, time_column)):
         if column_values is not None and not np.isfinite(column_values.values).all():
@@ -151,7 +164,8 @@ def _read_table(table_stream: BinaryIO) -> TextTable:
             )
         return text_table
     text_table = read_table(table_stream, ("#1",), max_rows=MAX_SAMPLES)
-    if text_table.column_count > 1 or text_table.columns["#1"].title:
+    angle_column = text_table.columns["#1"]
+    if text_table.column_count > 1 or (angle_column.title and not angle_column.unit):
         raise TableError(
             f"must name the columns {TIME_COLUMN} (s) and {ANGLE_COLUMN} (rad) in one line above "
             "the numbers, or be one column of angles in rad."

@@ -18,7 +18,7 @@ from rigd.text_table._cells import (
 from rigd.text_table._errors import MissingColumnError, TableError
 from rigd.text_table._head_rates import stated_rate_hz
 from rigd.text_table._stamps import is_stamp
-from rigd.text_table.titles import bare_unit, is_unit
+from rigd.text_table.titles import bare_unit, is_unit, stated_unit_of
 
 MAX_HEAD_LINES: Final = 500
 """Number of lines at the beginning of a file that are searched for the first line of numbers."""
@@ -590,7 +590,9 @@ def _layout_from_numbers(
     titles: Sequence[str] = ()
     titles_line_number = 0
     optional_column_count = 0
-    if rows_above and (len(_plain_titles(rows_above[-1])) > 1 or len(row.cells) == 1):
+    if rows_above and len(row.cells) == 1:
+        titles, titles_line_number = _title_of_single_column(rows_above)
+    elif rows_above and len(_plain_titles(rows_above[-1])) > 1:
         titles, titles_line_number = _plain_titles(rows_above[-1]), rows_above[-1].line_number
         optional_column_count = int(
             labview_head is not None and titles[-1:] == [_labview.COMMENT_COLUMN_TITLE]
@@ -627,6 +629,33 @@ def _layout_from_numbers(
         first_row_cells=tuple(row_cells),
         labview_head=labview_head,
     )
+
+
+def _title_of_single_column(rows_above: Sequence[TextRow]) -> tuple[Sequence[str], int]:
+    """Return the title of a table of one column, and its line number; nothing if it has none.
+
+    The title is the last line above the numbers that states no sampling rate, as one text. A line
+    of several words with a comment mark is a remark unless it names a unit.
+    """
+    for row in reversed(rows_above):
+        words = _plain_titles(row)
+        title = " ".join(words).strip('"')
+        if stated_rate_hz([title]) is not None:
+            continue
+        ends_in_unit = (
+            len(words) > 1
+            and len(words[-1]) > 1
+            and is_unit(words[-1])
+            and not is_any_number(words[-2])
+        )
+        if (
+            len(words) > 1
+            and is_comment_row(row.cells)
+            and not (ends_in_unit or stated_unit_of(title))
+        ):
+            break
+        return [title], row.line_number
+    return (), 0
 
 
 def _is_row_of_column_numbers(text_rows: Sequence[TextRow], row_index: int) -> bool:

@@ -7,8 +7,10 @@ _BRACKETED_UNIT_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
 """Pattern of brackets with their content at the end of a title."""
 _PRODUCT_SIGN_PATTERN: Final = re.compile(r"[\s.·⋅*-]")
 """Pattern of product signs and blanks in a unit."""
-_UNIT_AFTER_SLASH_PATTERN: Final = re.compile(r"(?:[/,]|\bin\b)\s*([^\s/,]+)\s*$")
-"""Pattern of the last word of a title after a slash, a comma or the word "in"."""
+_UNIT_AFTER_SLASH_PATTERN: Final = re.compile(
+    r"(?:[/,]|\b(?:in|units?|einheit)\b[\s:=]*)\s*([^\s/,]+)\s*$", re.IGNORECASE
+)
+"""Pattern of the last word of a title after a slash, a comma or the word "in" or "unit"."""
 
 _TIME_TITLE_PATTERN: Final = re.compile(
     r"(?:t|time|times|zeit|temps|tiempo|tempo|x_value|timestamps?|"
@@ -59,7 +61,7 @@ def stated_unit_of(title: str) -> str:
     ----------
     title : str
         Title of a column. Any text in square brackets is a unit. In parentheses, or after a slash,
-        a comma or the word "in", only known units are recognised.
+        a comma or the word "in" or "unit", only known units are recognised.
 
     Examples
     --------

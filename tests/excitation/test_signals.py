@@ -157,7 +157,16 @@ def test_csv_with_times_is_interpolated(tmp_path):
     assert excitation.parameters["file"] == "path.csv"
 
 
-@pytest.mark.parametrize("heading", ["", "angle_rad\n", "\ufeffangle_rad\r\n"])
+@pytest.mark.parametrize(
+    "heading",
+    [
+        "",
+        "angle_rad\n",
+        "\ufeffangle_rad\r\n",
+        "Angle [rad]\n",
+        "# chirp of rig 4, to 50 Hz\n# Sampling rate: 1 kHz\n",
+    ],
+)
 def test_csv_of_one_column_is_one_angle_per_tick(tmp_path, heading):
     path = tmp_path / "angles.csv"
     path.write_text(heading + "0.0\n0.1\n0.3\n", encoding="utf-8")
@@ -184,6 +193,11 @@ def test_csv_of_one_column_is_one_angle_per_tick(tmp_path, heading):
         ("time_s;angle_rad\n0;0.5\n1;0,5\n", "line 2: 'angle_rad' has a decimal point,"),
         ("time_s;angle_rad\ns;deg\n0;0.5\n1;0.5\n", "states another unit than rad"),
         ("time_s;angle_rad\nms;rad\n0;0.5\n1;0.5\n", "states another unit than s"),
+        ("angle [deg]\n0.5\n0.7\n", "states another unit than rad"),
+        ("# unit: mrad\n# Sampling rate: 1000 Hz\n0.5\n0.7\n", "states another unit than rad"),
+        ("Motor torque\n0.5\n0.7\n", "must name the columns time_s (s) and angle_rad (rad)"),
+        ("Sampling rate: 500 Hz\nangle_rad\n0.5\n0.7\n", "states 500 Hz above its angles"),
+        ("# dt = 2 ms\n0.5\n0.7\n", "states 500 Hz above its angles"),
         ("angle_rad\n0.5\n\n0.7\n", "line 3 is empty"),
         ("time_s,angle_rad\n1,0\n1,1\n", "line 3: time_s does not come after"),
         ("time_s,angle_rad\n0,0\n1e9,1\n", "4000 s is the most"),
