@@ -260,6 +260,13 @@ MAX_GAP_FRACTION: Final = 0.05
 """Largest permitted fraction of the steps between samples that are longer than one tick. With more,
 the times are too coarse to determine the rate, as whole milliseconds are at 700 Hz."""
 
+_MIN_ROUNDED_STEPS: Final = 3
+"""Smallest number of steps of two periods from which their distances show that time stamps are
+rounded."""
+
+_MAX_ROUNDED_DEVIATION: Final = 1e-3
+"""Largest range of the distances of rounded time stamps from ticks, in sample periods."""
+
 SESSION_RATE_RANGE_HZ: Final = (0.1, 1e6)
 """Lowest and highest sampling rate of a session."""
 
@@ -322,10 +329,7 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
             f"({time_s[first_bad_index + 1]:.9g} s); repair "
             "the times, or give --rate-hz instead of --time if the samples are equidistant."
         )
-    # The median distinguishes a step of one tick from a gap. The mean over all steps of one tick,
-    # unlike the median, does not depend on the number of digits of the times.
-    is_one_tick_step = steps_s < 1.5 * np.median(steps_s)
-    tick_steps = np.round(steps_s / steps_s[is_one_tick_step].mean())
+    tick_steps = _tick_steps(steps_s)
     gap_fraction = np.count_nonzero(tick_steps > 1) / len(tick_steps)
     if gap_fraction > MAX_GAP_FRACTION:
         raise ExchangeError(
@@ -333,6 +337,14 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
             f"{steps_s.max():.6g} s: {100 * gap_fraction:.2g} % of the steps would be gaps. Write "
             "the times with more digits, resample the record to one rate, or give --rate-hz "
             "instead of --time if the samples are equidistant."
+        )
+    rounded_timebase = timebase_of_rounded_stamps(time_s)
+    if rounded_timebase is not None:
+        raise ExchangeError(
+            f"{path}: the times '{channel}' have too few digits: steps of two periods follow at "
+            f"regular distances, as if they were rounded at {rounded_timebase.rate_hz:.9g} Hz. "
+            f"Write the times with more digits, or give --rate-hz {rounded_timebase.rate_hz:.9g} "
+            "instead of --time if no sample is missing."
         )
     ticks = np.concatenate(([0.0], np.cumsum(tick_steps)))
     if ticks[-1] + 1 > MAX_TICKS_PER_SAMPLE * len(ticks):
@@ -354,6 +366,47 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
             "stamps are off."
         )
     return Timebase(ticks.astype(np.int64), rate_hz, float(tick_deviation[worst_index]))
+
+
+def timebase_of_rounded_stamps(time_s: NDArray[np.float64]) -> Timebase | None:
+    """Return the time base of increasing time stamps that are rounded to about one period.
+
+    Return None for other time stamps. Rounded ones lie on ticks, and whenever the rounding adds up
+    to a period, a step has two periods although no sample is missing. The distances between these
+    steps are equal within one sample.
+    """
+    tick_steps = _tick_steps(np.diff(time_s))
+    distances = np.diff(np.flatnonzero(tick_steps == 2))
+    if (
+        len(distances) < _MIN_ROUNDED_STEPS - 1
+        or np.mean(np.abs(distances - np.median(distances)) <= 1.0) <= 0.5
+    ):
+        return None
+    stamp_ticks = np.concatenate(([0.0], np.cumsum(tick_steps)))
+    resolution_s = _regression_slope(stamp_ticks, time_s)
+    deviation = (time_s - time_s[0]) / resolution_s - stamp_ticks
+    if np.ptp(deviation) > _MAX_ROUNDED_DEVIATION:
+        return None
+    ticks = np.concatenate(([0.0], np.cumsum(np.where(tick_steps == 2, 1.0, tick_steps))))
+    period_s = _regression_slope(ticks, time_s)
+    deviation = (time_s - time_s.mean()) / period_s - (ticks - ticks.mean())
+    # The stamps determine the rate to about half a period over their span, so further digits say
+    # nothing.
+    rate_hz = next(
+        rate_hz
+        for digits in range(1, 18)
+        if abs((rate_hz := float(f"{1 / period_s:.{digits}g}")) * period_s - 1) <= 0.5 / ticks[-1]
+    )
+    return Timebase(ticks.astype(np.int64), rate_hz, float(np.abs(deviation).max()))
+
+
+def _tick_steps(steps_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the steps between time stamps in whole ticks."""
+    # The median distinguishes a step of one tick from a gap. The mean over all steps of one tick,
+    # unlike the median, does not depend on the number of digits of the times.
+    is_one_tick_step = steps_s < 1.5 * np.median(steps_s)
+    tick_steps: NDArray[np.float64] = np.round(steps_s / steps_s[is_one_tick_step].mean())
+    return tick_steps
 
 
 def _regression_slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:

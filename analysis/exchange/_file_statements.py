@@ -16,6 +16,7 @@ from analysis.exchange._channels import (
     MAX_JITTER_PERIODS,
     canonical_unit,
     timebase_from_stamps,
+    timebase_of_rounded_stamps,
     uniform_timebase,
     unit_in_brackets,
     unit_in_suffix,
@@ -242,9 +243,11 @@ class FileMetadataCheck:
         missing_ticks = 0
         file_rate_hz = 1 / (mean_step * best_unit_s)
         try:
-            file_timebase = timebase_from_stamps(
-                self.path, file_times.name, finite_times * best_unit_s
-            )
+            times_s = finite_times * best_unit_s
+            has_repetitions = bool((time_steps == 0.0).any())
+            file_timebase = (
+                None if has_repetitions else timebase_of_rounded_stamps(times_s)
+            ) or timebase_from_stamps(self.path, file_times.name, times_s)
         except ExchangeError:
             pass
         else:

@@ -503,3 +503,14 @@ def test_times_of_the_file_are_compared_with_the_rate(csv_of, make_plan, tmp_pat
             import_record(source, tmp_path / "a.mcap", make_plan())
     source = csv_of(t=1e3 * TIME_S + 5, angle=ANGLE, torque=TORQUE)
     assert import_record(source, tmp_path / "a.mcap", make_plan()).warnings == ()
+
+
+def test_times_of_too_few_digits_confirm_their_true_rate_only(csv_of, make_plan, tmp_path):
+    source = csv_of(t=np.round(np.arange(N) / 999, 3), angle=ANGLE, torque=TORQUE)
+    for options, words in (
+        ({"time": "t:s"}, "'t' have too few digits.* give --rate-hz 999 instead"),
+        ({"rate_hz": 1000.0}, "'t' show 999 Hz, and 1000 Hz was stated"),
+    ):
+        with pytest.raises(ExchangeError, match=words):
+            import_record(source, tmp_path / "a.mcap", make_plan(**options))
+    assert import_record(source, tmp_path / "a.mcap", make_plan(rate_hz=999.0)).rate_hz == 999.0

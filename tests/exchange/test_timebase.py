@@ -59,6 +59,8 @@ def test_inaccurate_clock_is_not_rounded_to_its_nominal_rate():
         ([0, 1e-3, 1e-3, 2e-3], ("sample 2", "does not increase", "--rate-hz")),
         ([0, 2e-3, 1e-3, 3e-3], ("sample 2 (0.002 s)", "sample 3 (0.001 s)")),
         (np.round(np.arange(1000) / 700, 3), ("unevenly", "0.001", "more digits")),
+        (np.round(np.arange(9000) / 999, 3), ("too few digits", "--rate-hz 999 instead")),
+        (3.7 + np.floor(np.arange(20_000) / 0.9983) / 10, ("more digits", "--rate-hz 9.983 ")),
         (np.round(np.arange(3000) / 1024, 3), ("does not increase",)),
         (np.cumsum(1e-3 + 4e-4 * np.sin(np.arange(500.0) / 20)), ("not equidistant", "Resample")),
         (np.arange(100) * 1e-7, ("1e+07 Hz", "unit of the time")),
