@@ -3,7 +3,7 @@
 import csv
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
+from itertools import dropwhile, islice, takewhile
 from typing import Final
 
 from rigd.text_table import _labview
@@ -39,6 +39,9 @@ _EXCEL_SEPARATOR_LINE: Final = "sep="
 """Beginning of the line with which Excel states the separator."""
 _MAX_LINES_BELOW_TITLES: Final = 6
 """Largest number of lines between the titles and the first line of numbers."""
+_TEXT_CHECK_ROWS: Final = 20
+"""Number of rows below a row with texts that are read to decide whether it belongs to the
+numbers."""
 _NUMBERING_CHECK_ROWS: Final = 5
 """Number of rows below a row 1, 2, 3, … that are read to decide whether it numbers the columns."""
 
@@ -415,7 +418,9 @@ def _layout_below_titles(
     for row in rows[titles_row_index + 1 : titles_row_index + 2 + _MAX_LINES_BELOW_TITLES]:
         row_cells = without_trailing_empty_cells(row.cells, column_count)
         has_table_width = column_count - optional_column_count <= len(row_cells) <= column_count
-        if has_table_width and _is_row_of_numbers(row_cells, column_indices, _row_after(rows, row)):
+        if has_table_width and _is_row_of_numbers(
+            row_cells, column_indices, _rows_after(rows, row)
+        ):
             _check_single_column(row.line_number, row_cells)
             return TableLayout(
                 separator=separator,
@@ -466,30 +471,51 @@ def comma_in_single_message(line_number: int) -> str:
 
 def _row_after(rows: Sequence[TextRow], earlier_row: TextRow) -> TextRow | None:
     """Return the row after a given one; None if it is the last."""
-    return next(
-        (later_row for later_row in rows if later_row.row_index > earlier_row.row_index), None
-    )
+    return next(iter(_rows_after(rows, earlier_row)), None)
+
+
+def _rows_after(rows: Sequence[TextRow], earlier_row: TextRow) -> Sequence[TextRow]:
+    """Return the rows after a given one, at most `_TEXT_CHECK_ROWS`."""
+    later_rows = (row for row in rows if row.row_index > earlier_row.row_index)
+    return list(islice(later_rows, _TEXT_CHECK_ROWS))
 
 
 def _is_row_of_numbers(
-    row_cells: Sequence[str], column_indices: Sequence[int], next_row: TextRow | None
+    row_cells: Sequence[str], column_indices: Sequence[int], rows_below: Sequence[TextRow]
 ) -> bool:
     """Return whether a row is one of the table's rows of numbers.
 
-    It must have numbers in the requested columns, and no text where the next row has a number.
+    It must have numbers in the requested columns, and no text at the head of a column of numbers.
     """
     if max(column_indices) >= len(row_cells):
         return False
     requested_cells = [
         row_cells[column_index] for column_index in column_indices if row_cells[column_index]
     ]
-    if not all(is_any_number(cell) or is_stamp(cell) for cell in requested_cells):
+    if not all(map(_is_value, requested_cells)):
         return False
     if not any(map(is_any_number, row_cells)):
         return False
-    return next_row is None or not any(
-        cell and not is_any_number(cell) and is_any_number(cell_below)
-        for cell, cell_below in zip(row_cells, next_row.cells, strict=False)
+    return not any(
+        cell
+        and not _is_value(cell)
+        and _begins_with_numbers_or_ends_in_them(
+            [row.cells[column_index] if column_index < len(row.cells) else "" for row in rows_below]
+        )
+        for column_index, cell in enumerate(row_cells)
+    )
+
+
+def _is_value(cell: str) -> bool:
+    """Return whether a cell is a number or a time stamp."""
+    return is_any_number(cell) or is_stamp(cell)
+
+
+def _begins_with_numbers_or_ends_in_them(cells: Sequence[str]) -> bool:
+    """Return whether the first cell is a number, or all cells are from the first number on."""
+    cells_from_value = list(dropwhile(lambda cell: not _is_value(cell), cells))
+    return bool(cells_from_value) and (
+        len(cells_from_value) == len(cells) or all(map(_is_value, cells_from_value))
     )
 
 
@@ -516,6 +542,11 @@ def _error_for_unexpected_row(
             and not is_stamp(row_cells[column_index])
         ):
             return not_a_number_error(row.line_number, column_name, row_cells[column_index])
+    return _texts_above_numbers_error(row)
+
+
+def _texts_above_numbers_error(row: TextRow) -> TableError:
+    """Return the error for a row with texts at the head of a column of numbers."""
     return TableError(
         f"line {row.line_number} has texts where the line below has numbers, and is not a row of "
         "units; remove it."
@@ -557,7 +588,7 @@ def _layout_from_numbers(
     if is_comment_row(row.cells):
         return None
     if not _is_row_of_numbers(
-        row.cells, column_indices, _row_after(rows, row)
+        row.cells, column_indices, _rows_after(rows, row)
     ) or _is_row_of_column_numbers(rows, row_index):
         filled_column_indices = [c for c in column_indices if c < len(row.cells) and row.cells[c]]
         number_column_indices = [c for c in filled_column_indices if is_any_number(row.cells[c])]
@@ -577,6 +608,7 @@ def _layout_from_numbers(
                 ),
             )
         return None
+    _check_rows_below_titles(rows_above, column_indices)
     units: Sequence[str] = ()
     last_rows_above = [
         without_trailing_empty_cells(other_row.cells, 0) for other_row in rows_above[-2:]
@@ -629,6 +661,20 @@ def _layout_from_numbers(
         first_row_cells=tuple(row_cells),
         labview_head=labview_head,
     )
+
+
+def _check_rows_below_titles(rows_above: Sequence[TextRow], column_indices: Sequence[int]) -> None:
+    """Raise if a row above the numbers, such as settings or statistics, is below the titles."""
+    if len(rows_above) < 2 or not _has_number(rows_above[-1], column_indices):
+        return
+    for row in rows_above[:-1]:
+        if len(row.cells) == len(rows_above[-1].cells) and not _has_number(row, column_indices):
+            raise _NotThisTableError(_RANK_ALL_TITLES, _texts_above_numbers_error(rows_above[-1]))
+
+
+def _has_number(row: TextRow, column_indices: Sequence[int]) -> bool:
+    """Return whether a row has a number in one of the columns."""
+    return any(is_any_number(row.cells[c]) for c in column_indices if c < len(row.cells))
 
 
 def _title_of_single_column(rows_above: Sequence[TextRow]) -> tuple[Sequence[str], int]:

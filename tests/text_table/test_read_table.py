@@ -121,6 +121,9 @@ def test_header_states_the_rate_in_words(line, rate_hz):
         ("t;a\n0;1\nMax;2\n", "a", ("line 3: '#1' is not a number ('Max')",)),
         ("u;a\n0;1\nMax;2\n", "a", ("line 3: column 1 is not a number ('Max')",)),
         ("u;a\n0;1\nu;a\n1;2\n", "a", ("line 3", "is not a number")),
+        ("t;a\nMin;0\nMax;1\n0;1\n1;2\n", "a", ("line 2 has texts where the line below",)),
+        ("t;a\nGain;2\n11:59:58;1\n11:59:59;2\n", "a", ("line 2 has texts",)),
+        ("t;a\nMin;0\nMax;1\nMean;0\n0;1\n1;2\n", "#2", ("line 4 has texts",)),
         ("t;a\n0;1\n# pause\n1;2\n", "a", ("line 3 has 1 cell",)),
         ("t;a\n0;1\n1;1_0\n", "a", ("line 3: 'a' is not a number ('1_0')",)),
         ("t;a\n0;1\n1\t2\n", "#2", ("line 3 has 1 cell",)),
@@ -136,6 +139,12 @@ def test_inconsistent_line_is_refused_with_its_number(text, name, words):
     message = refused(text, name)
     for word in words:
         assert word in message
+
+
+def test_texts_in_a_column_of_remarks_are_no_settings():
+    for remarks in (("start", "", "3", ""), ("0A", "0F", "12", "1B")):
+        text = "t;a;remark\n" + "".join(f"{n};{n}.5;{text}\n" for n, text in enumerate(remarks))
+        assert table(text, "a").columns["a"].values.tolist() == [0.5, 1.5, 2.5, 3.5]
 
 
 def test_missing_column_is_named_with_the_existing_ones():
