@@ -119,16 +119,27 @@ def are_split_decimals(rows: Sequence[Sequence[str]]) -> bool:
     """Return whether commas in decimal numbers (0,025) were taken as separators of cells.
 
     They were if every line consists of pairs of cells, an integer and the digits after the comma.
-    In at least one pair these digits must begin with a zero (025), unlike an integer.
+    One column without decimal points may precede, separate or follow the pairs. In at least one
+    pair these digits must begin with a zero (025), unlike an integer.
     """
+    cell_count = len(rows[0]) if rows else 0
+    if any(len(row) != cell_count for row in rows):
+        return False
+    if cell_count % 2 == 0:
+        return _are_pairs(rows)
+    return any(
+        not any(POINT in row[single_index] for row in rows)
+        and _are_pairs([[*row[:single_index], *row[single_index + 1 :]] for row in rows])
+        for single_index in range(0, cell_count, 2)
+    )
+
+
+def _are_pairs(rows: Sequence[Sequence[str]]) -> bool:
+    """Return whether all cells are pairs of an integer and decimals, some of them led by a zero."""
     has_leading_zero = False
     for row in rows:
         decimal_cells = [cell.strip() for cell in row[1::2]]
-        if (
-            not row
-            or len(row) % 2
-            or not all(map(_DECIMAL_DIGITS_PATTERN.fullmatch, decimal_cells))
-        ):
+        if not all(map(_DECIMAL_DIGITS_PATTERN.fullmatch, decimal_cells)):
             return False
         if not all(_INTEGER_PATTERN.fullmatch(cell.strip()) for cell in row[::2]):
             return False

@@ -229,9 +229,7 @@ def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLa
             failed_attempts.append(failure)
             continue
         if separator == ",":
-            _check_split_decimals(
-                text_rows[possible_layout.row_count_before_numbers :], possible_layout
-            )
+            _check_split_decimals(text_rows[possible_layout.row_count_before_numbers :])
         if (
             best_layout is None
             or possible_layout.row_count_before_numbers < best_layout.row_count_before_numbers
@@ -799,13 +797,9 @@ def _no_numbers_error(rows: Sequence[TextRow], requested_names: Sequence[str]) -
     )
 
 
-def _check_split_decimals(rows: Sequence[TextRow], layout: TableLayout) -> None:
+def _check_split_decimals(rows: Sequence[TextRow]) -> None:
     """Raise TableError if commas in decimal numbers were taken as separators of cells."""
-    nonempty_rows = [
-        without_trailing_empty_cells(row.cells, layout.column_count)
-        for row in rows
-        if any(row.cells)
-    ]
+    nonempty_rows = [without_trailing_empty_cells(row.cells, 0) for row in rows if any(row.cells)]
     if are_split_decimals(nonempty_rows):
         raise TableError(
             f"line {rows[0].line_number}: every second cell between commas looks like the decimals "

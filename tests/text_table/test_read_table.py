@@ -115,6 +115,8 @@ def test_header_states_the_rate_in_words(line, rate_hz):
         ("s;rad\n0;1;2\n1;2;3\n", "#2", ("line 2 has 3 cells",)),
         ("t a\n1 0 2\n2 1 3\n", "#2", ("line 2 has 3 cells",)),
         ("0,0,0,05\n0,1,0,15\n", "#2", ("line 1", "decimals of the one before")),
+        ("0,0,0000,0,05\n1,0,0010,0,15\n", "#3", ("line 1", "decimals of the one before")),
+        ("0,05,-0,01,\n0,15,-0,02,\n", "#2", ("line 1", "decimals of the one before")),
         ("t;a\n0;1,234\n1;999\n", "a", ("line 2", "thousands")),
         ("t;a\n0;1.234\n1;999\n", "a", ("line 2", "thousands")),
         ("t;a\n0;1,234\n1;2,345\n", "a", ("line 2", "thousands")),
@@ -145,6 +147,10 @@ def test_texts_in_a_column_of_remarks_are_no_settings():
     for remarks in (("start", "", "3", ""), ("0A", "0F", "12", "1B")):
         text = "t;a;remark\n" + "".join(f"{n};{n}.5;{text}\n" for n, text in enumerate(remarks))
         assert table(text, "a").columns["a"].values.tolist() == [0.5, 1.5, 2.5, 3.5]
+
+
+def test_numbers_with_leading_zeros_next_to_decimal_points_are_no_decimals():
+    assert table("0.1,7,0001\n0.2,7,0002\n", "#3").columns["#3"].values.tolist() == [1.0, 2.0]
 
 
 def test_missing_column_is_named_with_the_existing_ones():
