@@ -57,19 +57,25 @@ _UNITS_BY_NAME_SUFFIX: Final = {
     "rad": "rad",
     "mrad": "mrad",
     "deg": "deg",
+    "urad": "urad",
     "nm": "N.m",  # as in the fields of a session file
     "mnm": "mN.m",
+    "unm": "uN.m",
+    "ncm": "N.cm",
+    "nmm": "N.mm",
+    "knm": "kN.m",
     "n": "N",
+    "mn": "mN",
+    "kn": "kN",
     "s": "s",
     "ms": "ms",
     "us": "us",
+    "ns": "ns",
 }
 """Unit that the last word of a channel's name suggests."""
 
 _LEADING_NUMBER_PATTERN: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=\s*[^\s\d.])")
 """Pattern of a number that is followed by a unit."""
-_BRACKETS_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
-"""Pattern of a text in brackets at the end of a name."""
 
 
 def canonical_unit(unit_text: str) -> str | None:
@@ -109,22 +115,26 @@ def unit_factor(quantity: str, unit: str) -> float:
 
 
 def canonical_unit_text(unit: str) -> str:
-    """Return a unit as spelled in `UNIT_SIZES`, preceded by its number if this is not 1."""
+    """Return a unit as spelled in `UNIT_SIZES`, preceded by its number if one was stated."""
     unit_count, unit_spelling = _split_unit_number(unit)
     unit_name = canonical_unit(unit_spelling) or unit_spelling
-    return unit_name if unit_count == 1.0 else f"{unit_count!r} {unit_name}"
-
-
-def unit_in_brackets(channel_name: str) -> str | None:
-    """Return the unit in brackets after a name, as in ``Angle [deg]``, or None."""
-    bracket_match = _BRACKETS_PATTERN.search(channel_name)
-    return canonical_unit(bracket_match[1]) if bracket_match else None
+    return unit_name if unit_spelling == unit else f"{unit_count!r} {unit_name}"
 
 
 def unit_in_suffix(channel_name: str) -> str | None:
     """Return the unit that the last word of a name suggests, as in ``angle_rad``, or None."""
     _, underscore, last_word = channel_name.strip().rpartition("_")
-    return _UNITS_BY_NAME_SUFFIX.get(last_word) if underscore else None
+    return _UNITS_BY_NAME_SUFFIX.get(last_word.lower()) if underscore else None
+
+
+def is_same_unit(unit_label: str, unit: str) -> bool:
+    """Return whether a unit in a file may be a unit of `UNIT_SIZES`, in another case or language.
+
+    ``Deg`` is the degree, ``nm`` at a torque the newton metre. ``Grad`` is the degree in German,
+    but elsewhere the gon.
+    """
+    plain_label = _plain_spelling(unit_label).lower()
+    return plain_label == _plain_spelling(unit).lower() or (plain_label, unit) == ("grad", "deg")
 
 
 def _split_unit_number(unit: str) -> tuple[float, str]:
@@ -152,7 +162,6 @@ _UNITS_BY_SPELLING: Final = {
 _UNITS_BY_WORD: Final = {
     "degree": "deg",
     "degrees": "deg",
-    "grad": "deg",
     "radian": "rad",
     "radians": "rad",
     "sec": "s",

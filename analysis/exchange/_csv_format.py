@@ -48,6 +48,7 @@ def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel
             start_ns=column.start_ns,
             times=file_times,
             remark=table.remark,
+            title=column.title,
         )
         for channel_name, column in table.columns.items()
     }

@@ -15,14 +15,15 @@ import numpy as np
 from analysis.exchange._channels import (
     MAX_JITTER_PERIODS,
     canonical_unit,
+    is_same_unit,
     timebase_from_stamps,
     timebase_of_rounded_stamps,
     uniform_timebase,
-    unit_in_brackets,
     unit_in_suffix,
 )
 from analysis.exchange._source import ExchangeError, check_lengths
 from rigd.printable import printable
+from rigd.text_table.titles import bare_unit, is_unit, unit_in_brackets
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -105,26 +106,38 @@ class FileMetadataCheck:
         override it.
         """
         for choice in self.plan.channel_choices:
-            unit_label = channels[choice.channel].unit_label.strip()
-            stated_unit = (
-                canonical_unit(unit_label) if unit_label else unit_in_brackets(choice.channel)
-            )
-            if stated_unit is not None and stated_unit != choice.unit:
+            channel = channels[choice.channel]
+            channel_title = channel.title or choice.channel
+            unit_label = bare_unit(channel.unit_label) or unit_in_brackets(channel_title)
+            stated_unit = canonical_unit(unit_label)
+            has_number = " " in choice.unit
+            chosen_unit = choice.unit.removeprefix("1.0 ")
+            if stated_unit not in (None, chosen_unit):
                 self.report_contradiction(
                     f"the file says that '{choice.channel}' is in {stated_unit}, and {choice.unit} "
                     "was stated",
                     f"state '{choice.channel}:{stated_unit}', or correct the file",
                 )
-            if stated_unit is None and unit_label not in _NO_UNIT_TEXTS:
+            elif stated_unit is None and unit_label not in _NO_UNIT_TEXTS:
+                shown_label = printable(unit_label, 20)
+                if is_unit(unit_label) and not (
+                    has_number or is_same_unit(unit_label, choice.unit)
+                ):
+                    self.report_contradiction(
+                        f"the file says that '{choice.channel}' is in {shown_label}, and "
+                        f"{choice.unit} was stated",
+                        f"state the value of one {shown_label} in {choice.unit}, as a number and a "
+                        f"unit, such as '{choice.channel}:0.02 {choice.unit}'",
+                    )
                 self.warnings.append(
-                    f"The file states '{printable(unit_label, 20)}' for '{choice.channel}'; "
+                    f"The file states '{shown_label}' for '{choice.channel}'; "
                     f"{choice.unit} was used as stated."
                 )
-            suffix_unit = unit_in_suffix(choice.channel)
-            if stated_unit is None and suffix_unit not in (None, choice.unit):
+            suffix_unit = unit_in_suffix(channel_title)
+            if stated_unit is None and suffix_unit not in (None, chosen_unit):
                 self.warnings.append(
-                    f"The name '{choice.channel}' suggests {suffix_unit}; {choice.unit} was used "
-                    "as stated."
+                    f"The name '{printable(channel_title, 60)}' suggests {suffix_unit}; "
+                    f"{choice.unit} was used as stated."
                 )
 
     def check_scales(self, channels: Mapping[str, SourceChannel]) -> None:

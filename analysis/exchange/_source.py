@@ -73,6 +73,8 @@ class SourceChannel:
         Times of these samples in another channel of the file; None if there are none.
     unapplied_scale : str
         Scale stated in the file but not applied to the values; empty if there is none.
+    title : str
+        Title of the channel in the file; empty if it is the name under which it was requested.
     """
 
     values: NDArray[np.float64]
@@ -82,6 +84,7 @@ class SourceChannel:
     start_ns: int | None = None
     times: FileTimes | None = None
     unapplied_scale: str = ""
+    title: str = ""
 
 
 ReadChannels = Callable[[Path, Sequence[str]], Mapping[str, SourceChannel]]

@@ -163,6 +163,7 @@ def _source_channel(
         times=FileTimes(ABSCISSA, set_abscissae, unit_s)
         if is_time_axis and not is_evenly_spaced and not is_time_requested
         else None,
+        title=str(data_set["id1"]).strip(),
     )
 
 

@@ -18,7 +18,7 @@ from rigd.text_table._cells import (
 from rigd.text_table._errors import MissingColumnError, TableError
 from rigd.text_table._head_rates import stated_rate_hz
 from rigd.text_table._stamps import is_stamp
-from rigd.text_table.titles import bare_unit, is_unit, stated_unit_of
+from rigd.text_table.titles import bare_unit, is_unit, stated_unit_of, titles_by_units
 
 MAX_HEAD_LINES: Final = 500
 """Number of lines at the beginning of a file that are searched for the first line of numbers."""
@@ -640,7 +640,10 @@ def _layout_from_numbers(
                     )
                 ),
             )
-        titles, titles_line_number = (), 0  # titles of several words cannot be separated
+        # Titles of several words can only be separated behind their units.
+        titles = titles_by_units(" ".join(titles))
+        if len(titles) != len(row_cells):
+            titles, titles_line_number = (), 0
     column_count = len(titles) if titles else len(row_cells)
     _check_single_column(row.line_number, row_cells)
     return TableLayout(

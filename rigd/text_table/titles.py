@@ -1,10 +1,13 @@
 """Titles of columns: recognition of units in them, and of columns of times."""
 
 import re
+from itertools import pairwise
 from typing import Final
 
-_BRACKETED_UNIT_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
-"""Pattern of brackets with their content at the end of a title."""
+_BRACKETS_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]")
+"""Pattern of brackets with their content."""
+_SQUARE_BRACKETS_AT_END_PATTERN: Final = re.compile(r"\[([^\[\]()]*)\]\s*$")
+"""Pattern of square brackets with their content at the end of a title."""
 _PRODUCT_SIGN_PATTERN: Final = re.compile(r"[\s.·⋅*-]")
 """Pattern of product signs and blanks in a unit."""
 _UNIT_AFTER_SLASH_PATTERN: Final = re.compile(
@@ -46,7 +49,9 @@ TIME_UNITS_S: Final = {
 _NON_TIME_UNITS: Final = (
     "rad", "mrad", "urad", "deg", "degree", "degrees", "radian", "radians", "arcmin", "arcsec",
     "rev", "grad", "°", "nm", "mnm", "unm", "ncm", "nmm", "knm", "newtonmeter", "newtonmetre",
-    "lbfin", "ozfin", "n", "mn", "kn", "lbf", "v", "mv", "volt", "volts", "a", "ma", "amp", "mm",
+    "lbfin", "ozfin", "mnmm", "unmm", "kgfm", "kgfcm", "kgcm", "gfcm", "lbfft", "ftlbf", "inlbf",
+    "lbft", "ftlb", "lbin", "inlb", "ozin", "gon", "mgon",
+    "n", "mn", "kn", "lbf", "v", "mv", "volt", "volts", "a", "ma", "amp", "mm",
     "m", "cm", "g", "kg", "hz", "khz", "rpm", "1/min", "%", "count", "counts", "digit", "digits",
     "m/s", "m/s²", "m/s^2", "m/s2", "rad/s", "rad/s²", "rad/s^2", "deg/s", "°/s", "°c", "degc",
     "k", "pa", "bar", "pu", "w",
@@ -60,8 +65,9 @@ def stated_unit_of(title: str) -> str:
     Parameters
     ----------
     title : str
-        Title of a column. Any text in square brackets is a unit. In parentheses, or after a slash,
-        a comma or the word "in" or "unit", only known units are recognised.
+        Title of a column. Any text in square brackets at the end is a unit. Elsewhere in brackets,
+        in parentheses, or after a slash, a comma or the word "in" or "unit", only known units are
+        recognised.
 
     Examples
     --------
@@ -69,11 +75,36 @@ def stated_unit_of(title: str) -> str:
     >>> stated_unit_of("Angle [deg]"), stated_unit_of("t/ms"), stated_unit_of("Rig/Angle")
     ('deg', 'ms', '')
     """
-    unit_match = _BRACKETED_UNIT_PATTERN.search(title) or _UNIT_AFTER_SLASH_PATTERN.search(title)
-    if unit_match is None:
+    unit = unit_in_brackets(title)
+    if unit:
+        return unit
+    word_match = _UNIT_AFTER_SLASH_PATTERN.search(title)
+    if word_match and is_unit(word_match[1]):
+        return word_match[1]
+    last_brackets_match = _SQUARE_BRACKETS_AT_END_PATTERN.search(title)
+    return last_brackets_match[1].strip() if last_brackets_match else ""
+
+
+def unit_in_brackets(title: str) -> str:
+    """Return the known unit in brackets in a title such as ``Angle [deg] CH1``; "" if none.
+
+    Of several units, the one at the end is returned, or else the first.
+    """
+    known_units = [
+        (brackets[1].strip(), brackets.end())
+        for brackets in _BRACKETS_PATTERN.finditer(title.rstrip())
+        if is_unit(brackets[1])
+    ]
+    if not known_units:
         return ""
-    is_certain_unit = is_unit(unit_match[1]) or unit_match[0].startswith("[")
-    return unit_match[1].strip() if is_certain_unit else ""
+    last_unit, last_end = known_units[-1]
+    return last_unit if last_end == len(title.rstrip()) else known_units[0][0]
+
+
+def titles_by_units(text: str) -> list[str]:
+    """Return the titles in a text such as ``Time [s] Shaft angle [deg]``, each up to its unit."""
+    ends = [brackets.end() for brackets in _BRACKETS_PATTERN.finditer(text) if is_unit(brackets[1])]
+    return [text[start:end].strip() for start, end in pairwise([0, *ends])]
 
 
 def is_unit(cell: str) -> bool:

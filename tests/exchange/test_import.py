@@ -182,7 +182,15 @@ def test_unit_contradicted_by_the_file_is_refused(csv_of, make_plan, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("title", "unit"), [("Tz (N·mm) ", "N.mm"), ("Tz [mNm]", "mN.m"), ("Tz (raw)", None)]
+    ("title", "unit"),
+    [
+        ("Tz (N·mm) ", "N.mm"),
+        ("Tz [mNm]", "mN.m"),
+        ("Tz [N.mm] (raw)", "N.mm"),
+        ("Tz (kgf·cm) CH2", "kgf·cm"),
+        ("Tz (raw)", None),
+        ("Tz [Nm] CH2", None),
+    ],
 )
 def test_unit_in_brackets_is_a_statement_of_the_file(csv_of, make_plan, tmp_path, title, unit):
     source = csv_of(**{"angle": ANGLE, title: TORQUE})
@@ -213,6 +221,29 @@ def test_name_that_suggests_another_unit_is_reported(
         assert suggestion in warning
 
 
+def test_titles_state_units_of_columns_given_by_number(csv_of, make_plan, tmp_path):
+    source = csv_of(t_s=TIME_S, Angle_deg=ANGLE, torque_nmm=TORQUE)
+    done = import_record(source, tmp_path / "a.mcap", make_plan("#2:rad", "#3:N.m"))
+    assert "'Angle_deg' suggests deg" in done.warnings[0]
+    assert "'torque_nmm' suggests N.mm" in done.warnings[1]
+    blanks = tmp_path / "blanks.txt"
+    titles = "Time [s]  Motor angle [deg]  Torque [N.m]"
+    blanks.write_text(
+        source.read_text().replace(",", " ").replace("t_s Angle_deg torque_nmm", titles)
+    )
+    with pytest.raises(ExchangeError, match="'#2' is in deg, and rad was stated"):
+        import_record(blanks, tmp_path / "b.mcap", make_plan("#2:rad", "#3:N.m"))
+
+
+@pytest.mark.parametrize("unit", ["Grad", "DEG"])
+def test_unit_of_unclear_spelling_is_compared(csv_of, make_plan, tmp_path, unit):
+    source = csv_of(**{f"angle [{unit}]": ANGLE, "torque": TORQUE})
+    done = import_record(source, tmp_path / "a.mcap", make_plan(f"angle [{unit}]:deg"))
+    assert f"states '{unit}' for" in done.warnings[0]
+    with pytest.raises(ExchangeError, match=f"is in {unit}, and rad was stated"):
+        import_record(source, tmp_path / "b.mcap", make_plan(f"angle [{unit}]:rad"))
+
+
 def test_stated_rate_and_unit_are_compared(make_plan, tmp_path):
     tdms = pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
     source = tmp_path / "a.tdms"
@@ -231,6 +262,9 @@ def test_stated_rate_and_unit_are_compared(make_plan, tmp_path):
     with pytest.raises(ExchangeError, match="is in rad, and deg was stated"):
         import_record(source, tmp_path / "a.mcap", make_plan(**options))
     channels(unit_string="V")
+    with pytest.raises(ExchangeError, match="is in V, and deg was stated; state the value of one"):
+        import_record(source, tmp_path / "a.mcap", make_plan(**options))
+    options["angle"] = "g/angle:1 deg"
     done = import_record(source, tmp_path / "a.mcap", make_plan(**options))
     assert "states 'V' for 'g/angle'" in done.warnings[0]
     with pytest.raises(ExchangeError, match="'g/torque' was sampled at 1000 Hz, and 500 Hz was"):

@@ -52,6 +52,7 @@ def test_unit_has_its_factor(quantity, unit, size):
         ("angle", ""),
         ("time", "min"),
         ("angle", "V"),
+        ("angle", "grad"),
         ("angle", "0.02"),
         ("angle", "0 rad"),
         ("angle", "0.02 N.m"),

@@ -193,6 +193,9 @@ def test_units_of_titles():
         "M in Nm": "Nm",
         "Tz (mN·m)": "mN·m",
         "a [1e-3]": "1e-3",
+        "Angle [deg] CH1": "deg",
+        "Time (ms) rel": "ms",
+        "Angle (deg) [filtered]": "deg",
     }
     for title, unit in unit_of_title.items():
         assert stated_unit_of(title) == unit
