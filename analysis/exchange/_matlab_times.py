@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from analysis.exchange._source import ExchangeError, FileTimes
+from analysis.exchange._source import ExchangeError, FileTimes, first_times
 from rigd.text_table.titles import is_title_of_times, time_unit_s
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def stated_times(
     while parent_name:
         parent_name = parent_name.rpartition(".")[0]
         rate_hz: float | None = None
-        file_times: FileTimes | None = None
+        possible_times: list[FileTimes] = []
         for field_name in list_sibling_names(parent_name):
             sibling_name = f"{parent_name}.{field_name}" if parent_name else field_name
             if sibling_name in channel_names or not is_name_of_times(field_name):
@@ -68,9 +68,12 @@ def stated_times(
             ):
                 rate_hz = 1 / float(sibling_values[0])
             elif len(sibling_values) == sample_count and is_title_of_times(field_name):
-                file_times = FileTimes(
-                    sibling_name, sibling_values, time_unit_s(field_name.rpartition("_")[2])
+                possible_times.append(
+                    FileTimes(
+                        sibling_name, sibling_values, time_unit_s(field_name.rpartition("_")[2])
+                    )
                 )
+        file_times = first_times(possible_times)
         if rate_hz is not None or file_times is not None:
             return rate_hz, file_times
     return None, None

@@ -15,6 +15,7 @@ import numpy as np
 from rigd.plugins import Plugin, PluginError, Registry, load_plugin, plugin_errors
 from rigd.printable import printable
 from rigd.session.limits import MAX_SAMPLES
+from rigd.text_table.titles import are_times
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -401,6 +402,12 @@ def channel_index(
         else titles
     )
     raise no_such_channel_error(path, channel_name, listed_titles)
+
+
+def first_times(possible_times: Sequence[FileTimes]) -> FileTimes | None:
+    """Return the first of several channels of times that increases, or else the first, if any."""
+    increasing_times = (times for times in possible_times if are_times(times.values))
+    return next(increasing_times, next(iter(possible_times), None))
 
 
 def real_vector(path: Path, channel_name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:

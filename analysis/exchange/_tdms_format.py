@@ -16,11 +16,12 @@ from analysis.exchange._source import (
     SourceChannel,
     bounded_memory,
     check_sample_count,
+    first_times,
     missing_library_error,
     no_such_channel_error,
     real_vector,
 )
-from rigd.text_table.titles import is_title_of_times, time_unit_s
+from rigd.text_table.titles import is_title_of_times, is_unit_of_other_quantity, time_unit_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -224,6 +225,7 @@ def _group_times(
 ) -> FileTimes | None:
     """Return the times in a channel of the same group that was not requested, or None."""
     channel = channels[channel_name]
+    possible_times: list[FileTimes] = []
     for other_name, other_channel in channels.items():
         if (
             other_name in channel_names
@@ -236,5 +238,8 @@ def _group_times(
             time_channel = _read_channel(path, other_name, channels, False)
         except ExchangeError:  # the channel has texts, for example
             continue
-        return FileTimes(other_name, time_channel.values, time_unit_s(time_channel.unit_label))
-    return None
+        if not is_unit_of_other_quantity(time_channel.unit_label):
+            possible_times.append(
+                FileTimes(other_name, time_channel.values, time_unit_s(time_channel.unit_label))
+            )
+    return first_times(possible_times)

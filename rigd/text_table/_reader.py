@@ -3,7 +3,7 @@
 import csv
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from io import TextIOWrapper
 from itertools import islice
@@ -36,7 +36,13 @@ from rigd.text_table._layout import (
     wrong_width_message,
 )
 from rigd.text_table._stamps import StampReader, is_stamp
-from rigd.text_table.titles import is_title_of_times, stated_unit_of, time_unit_s
+from rigd.text_table.titles import (
+    are_times,
+    is_title_of_times,
+    is_unit_of_other_quantity,
+    stated_unit_of,
+    time_unit_s,
+)
 
 MAX_LINE_CHARACTERS: Final = 65_536
 """Largest number of characters in a line; a longer line is an error.
@@ -174,7 +180,8 @@ def _read_encoded_table(
 ) -> TextTable:
     """Read columns of a text with a given encoding."""
     with _open_lines(stream, encoding) as text_lines:
-        table_layout = find_layout(_first_lines(text_lines), requested_names)
+        first_lines = _first_lines(text_lines)
+    table_layout = find_layout(first_lines, requested_names)
     first_cells = [
         table_layout.first_row_cells[column_index]
         for column_index in table_layout.requested_column_indices
@@ -182,13 +189,22 @@ def _read_encoded_table(
     decimal_sign = (
         COMMA if any(COMMA in cell and not is_stamp(cell) for cell in first_cells) else POINT
     )
+    times_column_index = _find_times_column_index(table_layout, first_lines)
     try:
         return _read_columns(
-            stream, encoding, table_layout, requested_names, max_rows, decimal_sign
+            stream,
+            encoding,
+            table_layout,
+            requested_names,
+            max_rows,
+            decimal_sign,
+            times_column_index,
         )
     except _DecimalCommaError:
         # Read again from the start: a point in earlier lines may not be a decimal point.
-        return _read_columns(stream, encoding, table_layout, requested_names, max_rows, COMMA)
+        return _read_columns(
+            stream, encoding, table_layout, requested_names, max_rows, COMMA, times_column_index
+        )
 
 
 def _first_lines(lines: Iterator[str]) -> list[str]:
@@ -379,9 +395,9 @@ def _read_columns(
     requested_names: Sequence[str],
     max_rows: int,
     decimal_sign: str,
+    times_column_index: int | None,
 ) -> TextTable:
     """Read the requested columns and the column of times, with a given decimal sign."""
-    times_column_index = _find_times_column_index(layout)
     column_indices_to_read = sorted(
         {
             *layout.requested_column_indices,
@@ -493,21 +509,63 @@ def _blank_lines_remark(row_reader: _NumberRowReader) -> str:
     )
 
 
-def _find_times_column_index(layout: TableLayout) -> int | None:
-    """Return the index of a column of times that is not requested; None if there is none."""
-    for column_index, cell in enumerate(layout.first_row_cells):
-        if column_index in layout.requested_column_indices or not (
-            is_any_number(cell) or is_stamp(cell)
-        ):
-            continue
-        if is_stamp(cell):
+def _find_times_column_index(layout: TableLayout, first_lines: Sequence[str]) -> int | None:
+    """Return the index of a column of times that is not requested; None if there is none.
+
+    Of several columns by title or unit, it is the first whose values in the first lines increase.
+    """
+    candidate_indices = [
+        column_index
+        for column_index in range(len(layout.first_row_cells))
+        if column_index not in layout.requested_column_indices
+        and _may_be_times(layout, column_index)
+    ]
+    if not layout.titles:
+        return next(iter(candidate_indices), None)
+    first_rows = [
+        row
+        for _, row in islice(
+            rows_of_cells(_skip_excel_separator_line(iter(first_lines)), layout.separator),
+            layout.row_count_before_numbers,
+            None,
+        )
+    ]
+    for column_index in candidate_indices:
+        if are_times(_first_values(first_rows, column_index)):
             return column_index
-        if not layout.titles:
-            return column_index if column_index == 0 else None
-        column_title = layout.titles[column_index]
-        if is_title_of_times(column_title) or _time_unit_s(layout, column_index) is not None:
-            return column_index
-    return None
+    return next((c for c in candidate_indices if is_title_of_times(layout.titles[c])), None)
+
+
+def _may_be_times(layout: TableLayout, column_index: int) -> bool:
+    """Return whether a column may have times by its title, its unit and its first cell."""
+    first_cell = layout.first_row_cells[column_index]
+    if is_stamp(first_cell):
+        return True
+    if not is_any_number(first_cell):
+        return False
+    if not layout.titles:
+        return column_index == 0
+    if is_unit_of_other_quantity(_unit_in_file(layout, column_index)):
+        return False
+    return (
+        is_title_of_times(layout.titles[column_index])
+        or _time_unit_s(layout, column_index) is not None
+    )
+
+
+def _first_values(rows: Sequence[Sequence[str]], column_index: int) -> npt.NDArray[np.float64]:
+    """Return the numbers or times of day of a column in some rows, without invalid cells."""
+    read_stamp = StampReader()
+    values = []
+    for row in rows:
+        cell = row[column_index].strip() if column_index < len(row) else ""
+        with suppress(ValueError):
+            values.append(
+                read_stamp(cell)
+                if is_stamp(cell)
+                else parse_number(cell, COMMA if COMMA in cell else POINT)
+            )
+    return np.array(values, dtype=np.float64)
 
 
 def _time_unit_s(layout: TableLayout, column_index: int) -> float | None:

@@ -4,6 +4,9 @@ import re
 from itertools import pairwise
 from typing import Final
 
+import numpy as np
+import numpy.typing as npt
+
 _BRACKETS_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]")
 """Pattern of brackets with their content."""
 _SQUARE_BRACKETS_AT_END_PATTERN: Final = re.compile(r"\[([^\[\]()]*)\]\s*$")
@@ -16,12 +19,20 @@ _UNIT_AFTER_SLASH_PATTERN: Final = re.compile(
 """Pattern of the last word of a title after a slash, a comma or the word "in" or "unit"."""
 
 _TIME_TITLE_PATTERN: Final = re.compile(
-    r"(?:t|time|times|zeit|temps|tiempo|tempo|x_value|timestamps?|"
+    r"(?:time|times|zeit|temps|tiempo|tempo|x_value|timestamps?|"
     r"(?:rel\w*|abs\w*|elapsed|sample|sampling|measurement)[ _]time)"
     r"(?=$|[\s\[(/,:_])",
     re.IGNORECASE,
 )
 """Pattern of the beginning of the title of a column of times, in several languages."""
+_SYMBOL_OF_TIME_PATTERN: Final = re.compile(
+    r"t(?:$|\s*[\[(]|(?:\s*[/,:_]\s*|\s+(?:in\s+)?)(?P<rest>\w+)\s*$)"
+)
+"""Pattern of a title that begins with the symbol t, such as ``t``, ``t [s]`` or ``t_ms``."""
+_WORDS_AFTER_SYMBOL: Final = ("rel", "abs", "0")
+"""Words other than units that may follow the symbol t in the title of a column of times."""
+_MAX_DECREASING_FRACTION: Final = 0.1
+"""Largest fraction of the steps of a column of times that may go back, as to another record."""
 
 TIME_UNITS_S: Final = {
     "s": 1.0,
@@ -133,7 +144,24 @@ def _plain_unit_spelling(cell: str) -> str:
 
 def is_title_of_times(title: str) -> bool:
     """Return whether a title is that of a column of times."""
-    return _TIME_TITLE_PATTERN.match(title.strip()) is not None
+    if _TIME_TITLE_PATTERN.match(title.strip()):
+        return True
+    symbol_match = _SYMBOL_OF_TIME_PATTERN.match(title.strip())
+    if symbol_match is None:
+        return False
+    rest = symbol_match["rest"]
+    return rest is None or rest in _WORDS_AFTER_SYMBOL or time_unit_s(rest) is not None
+
+
+def is_unit_of_other_quantity(unit: str) -> bool:
+    """Return whether a unit is known and is no unit of time."""
+    return is_unit(unit) and time_unit_s(unit) is None
+
+
+def are_times(values: npt.NDArray[np.float64]) -> bool:
+    """Return whether the values of a column increase as times do, apart from a few steps."""
+    steps = np.diff(values[np.isfinite(values)])
+    return bool((steps > 0.0).any() and np.mean(steps < 0.0) < _MAX_DECREASING_FRACTION)
 
 
 def time_unit_s(unit: str) -> float | None:

@@ -189,6 +189,16 @@ def test_matlab_states_times_and_units(tmp_path):
     assert channels["q.Data"].times.name == "q.Time"
 
 
+def test_first_times_that_increase_are_those_of_the_file(tdms, tmp_path):
+    variables = {"time_out": [5.0, 5.0, 5.0], "time": [0.0, 1.0, 2.0], "a": [1.0, 2.0, 1.0]}
+    scipy.io.savemat(tmp_path / "a.mat", variables)
+    with tdms.TdmsWriter(str(tmp_path / "a.tdms")) as writer:
+        writer.write_segment([tdms.ChannelObject("g", *pair) for pair in variables.items()])
+    for name, channel in (("a.mat", "a"), ("a.tdms", "g/a")):
+        _, channels = read_source(tmp_path / name, [channel])
+        assert channels[channel].times.values.tolist() == [0.0, 1.0, 2.0]
+
+
 def test_matlab_7_3_texts_and_objects_are_no_numbers(tmp_path):
     def write(file):
         for name, kind in (("text", "char"), ("series", "timeseries")):

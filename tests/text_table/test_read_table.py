@@ -173,7 +173,11 @@ def test_times_of_day_are_seconds():
 def test_unrequested_times_are_found_with_their_unit():
     for title, unit_s in (("t", None), ("Time [ms]", 1e-3), ("zeit_us", 1e-6), ("x [s]", 1.0)):
         assert table(f"{title};a\n0;1\n1;2\n", "a").times.unit_s == unit_s
-    assert table("target;a\n0;1\n1;2\n", "a").times is None
+    for title in ("target", "T_z", "T [°C]", "t_set"):
+        assert table(f"{title};a\n0;1\n1;2\n", "a").times is None
+    for title in ("Time out [s]", "Latency [us]"):
+        found = table(f"{title};x [s];a\n5;0,1;1\n4;0,2;2\n5;0,3;1\n", "a")
+        assert (found.times.title, found.times.values.tolist()) == ("x [s]", [0.1, 0.2, 0.3])
 
 
 def test_reading_ends_at_the_maximum_of_rows():
