@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from analysis.exchange._source import ExchangeError
 from analysis.record_checks import (
@@ -21,6 +22,37 @@ from rigd.units import finite_number, unit_of
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
+
+
+_USED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
+    "rig": ("axis_tilt_deg",),
+    "beam": ("length_m", "density_kg_per_m", "bending_stiffness_n_m2", "tip_mass_kg"),
+    "sensor": ("tool_inertia_kg_m2",),
+    "uncertainty": (
+        *(f"{quantity}_percent" for quantity in UNCERTAIN_QUANTITIES),
+        "uniformity_percent",
+    ),
+}
+"""Keys that are read, by section."""
+_UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
+    "rig": ("rate_hz",),
+    "beam": ("damping",),
+    "sensor": (
+        "resolution",
+        "range",
+        "projection",
+        "delay_s",
+        "filter_hz",
+        "filter_order",
+        "shear_projection",
+    ),
+}
+"""Other keys that a profile has in these sections."""
+_UNUSED_SECTIONS: Final = (
+    "motor", "encoder", "actuation", "control", "limits", "session", "realtime", "metadata",
+    "devices", "can", "acquisition", "cia402", "ati_can", "ati_serial", "simulation",
+)  # fmt: skip
+"""Other sections of a profile. The parts of installed packages may have further ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +90,8 @@ def read_specimen(path: Path) -> SpecimenFile:
 
     Only ``[beam]`` is required. A number is given alone or, as in a profile, with its origin:
     ``{ value = 0.98, source = "measured" }``. Other entries of a profile are not used, because they
-    describe the rig's own recorder and not the one of the imported record.
+    describe the rig's own recorder and not the one of the imported record. Entries that no profile
+    has are refused, because they may be misspelt.
 
     Raises
     ------
@@ -80,6 +113,7 @@ def read_specimen(path: Path) -> SpecimenFile:
         _read_section(path, file_content, section_name)
         for section_name in ("rig", "beam", "sensor", "uncertainty")
     )
+    _check_keys(path, file_content)
     read_percent = partial(
         _number_in_range, path, "uncertainty", uncertainty_section, min_value=0.0
     )
@@ -133,6 +167,45 @@ def _read_section(path: Path, content: Mapping[str, Any], section_name: str) -> 
     return section
 
 
+def _check_keys(path: Path, content: Mapping[str, Any]) -> None:
+    """Raise if the file has a section, or a key in one of the used sections, that is unknown."""
+    for name, entry in content.items():
+        if name in _USED_KEYS:
+            for key in entry:
+                if key not in (*_USED_KEYS[name], *_UNUSED_KEYS.get(name, ())):
+                    raise ExchangeError(f"{path}: {name}.{key} is unknown; {_remedy(name, key)}.")
+        elif not isinstance(entry, dict):
+            if isinstance(entry, int | float):
+                raise ExchangeError(
+                    f"{path}: {name} is in no section; write it below one of the sections "
+                    f"{', '.join(f'[{section}]' for section in _USED_KEYS)}."
+                )
+        elif name not in _UNUSED_SECTIONS:
+            similar_names = difflib.get_close_matches(name.lower(), _USED_KEYS, 1, 0.75)
+            # A profile, which selects devices, may have sections of installed packages.
+            if similar_names or "devices" not in content:
+                raise ExchangeError(
+                    f"{path}: the section [{name}] is unknown; "
+                    + (
+                        f"write [{similar_names[0]}]."
+                        if similar_names
+                        else f"remove it, as only "
+                        f"{', '.join(f'[{section}]' for section in _USED_KEYS)} are used."
+                    )
+                )
+
+
+def _remedy(section_name: str, unknown_key: str) -> str:
+    """Return what to do about an unknown key: another section, another spelling, or removal."""
+    for other_section, keys in _USED_KEYS.items():
+        if unknown_key in keys:
+            return f"write it in section [{other_section}]"
+    similar_keys = difflib.get_close_matches(unknown_key, _USED_KEYS[section_name], 1)
+    if similar_keys:
+        return f"write {similar_keys[0]}, in {unit_of(similar_keys[0])}"
+    return f"remove it, as [{section_name}] has {', '.join(_USED_KEYS[section_name])}"
+
+
 def _positive_number(path: Path, section: Mapping[str, Any], key: str) -> float:
     """Return a positive number of the beam; raise if it is missing or not positive."""
     number = _required_number(path, "beam", section, key)
@@ -171,6 +244,12 @@ def _required_number(path: Path, section_name: str, section: Mapping[str, Any], 
     """
     section_value, unit_text = section.get(key), unit_of(key)
     if isinstance(section_value, dict):
+        other_parts = sorted(section_value.keys() - {"value", "source"})
+        if other_parts:
+            raise ExchangeError(
+                f"{path}: {section_name}.{key} has the unknown part '{other_parts[0]}'; state the "
+                f"value in {unit_text}, with value and source only."
+            )
         section_value = section_value.get("value")
     if section_value is None:
         raise ExchangeError(

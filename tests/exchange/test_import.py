@@ -354,6 +354,14 @@ def test_specimen_from_a_profile_or_three_lines(profile, tmp_path):
     assert (specimen.uncertainty_percent, specimen.uniformity_percent) == ({"length": 0.1}, 0.0)
 
 
+def test_a_profile_may_have_sections_of_installed_packages(profile, tmp_path):
+    path = tmp_path / "rig.toml"
+    for shipped in profile.parent.glob("*.toml"):
+        text = shipped.read_text(encoding="utf-8")
+        path.write_text(f"{text}\n[netft]\nhost = 'box'\n", encoding="utf-8")
+        assert read_specimen(path).beam.length_m > 0.0
+
+
 def test_tip_mass_and_tilt_of_a_profile_go_into_the_session(csv_of, make_plan, tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(
@@ -406,6 +414,47 @@ def test_the_uniformity_of_the_specimen_goes_into_the_session(
         ("[beam", ("not valid TOML",)),
         ("a = " + "[\n" * 100_000, ("nested too deeply",)),
         ("#" * 250_001, ("at most 0.25 MB",)),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "tip_mass_g = 5",
+            ("beam.tip_mass_g is unknown; write tip_mass_kg, in kg",),
+        ),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "axis_tilt_deg = 1",
+            ("write it in section [rig]",),
+        ),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "[sensor]\ntool_inertia = 1e-4",
+            ("sensor.tool_inertia is unknown; write tool_inertia_kg_m2",),
+        ),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "[rig]\naxis_tilt = 2",
+            ("rig.axis_tilt is unknown",),
+        ),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "[Sensor]\ntool_inertia_kg_m2 = 1e-4",
+            ("[Sensor] is unknown; write [sensor].",),
+        ),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "[uncertaintty]\nlength_percent = 1\n[devices]\ndrive = 'x'",
+            ("write [uncertainty].",),
+        ),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "[clamp]\ninertia = 1",
+            ("the section [clamp] is unknown; remove it",),
+        ),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "[rig]\naxis_tilt_deg = { value = 5, unit = 'mrad' }",
+            ("the unknown part 'unit'; state the value in °",),
+        ),
+        ("tip_mass_kg = 1\n[beam]\nlength_m = 1", ("tip_mass_kg is in no section",)),
     ],
 )
 def test_invalid_specimen_is_refused(tmp_path, text, words):
