@@ -89,10 +89,20 @@ def exported_models(simulated, analyze, tmp_path, monkeypatch):
 
 
 @pytest.mark.further  # the content is tested in test_model_export.py
-def test_the_examples_read_a_model(exported_models, capsys):
-    _, with_scipy, with_control = blocks("python")
-    exec(with_scipy, {})
+def test_the_examples_read_a_model(simulated, analyze, exported_models, capsys):
+    _, with_numpy, with_control = blocks("python")
+    exec(with_numpy, {})
     assert "torque per angle: [" in capsys.readouterr().out
+    in_discrete_time = 's = np.exp(1j * omega * float(model["Ts"]))'
+    assert in_discrete_time in DOCUMENT
+    options = ("--beam", "--samples", 0, "--order", 14, "--rate", 1000)
+    assert analyze("export", "model", simulated, "sampled.npz", *options).exit_code == 0
+    example = with_numpy.replace("antenna", "sampled").replace("s = 1j * omega", in_discrete_time)
+    continuous, sampled = {}, {}
+    exec(with_numpy, continuous)
+    exec(example, sampled)
+    responses = [each["torque_per_acceleration"] for each in (continuous, sampled)]
+    np.testing.assert_allclose(*np.abs(responses), rtol=1e-2)
     pytest.importorskip("control", reason="an example reads a model with python-control")
     exec(with_control, {})
     assert re.search(r"1[47] poles", capsys.readouterr().out)  # 3 of a delay, if it is positive
