@@ -179,7 +179,13 @@ def read_session_part(
         Session with at least the samples of the part, and those of its rest.
     interval_s : tuple of float or None
         Beginning and end in seconds of the interval that was read; None for all samples.
+
+    Raises
+    ------
+    RecordError
+        The part does not end after its beginning, or a time is no finite number.
     """
+    _check_times_of_part(path, part_s)
     read = partial(read_session, path, fields=fields, max_samples=max_samples)
     if part_s is not None:
         interval_s = (part_s[0] or 0.0, math.inf if part_s[1] is None else part_s[1])
@@ -188,6 +194,22 @@ def read_session_part(
             if _contains_part(session.samples["tick"], part_s, stated_rate_hz(session)):
                 return session, interval_s
     return read(), None
+
+
+def _check_times_of_part(path: Path, part_s: PartOption | None) -> None:
+    """Raise if a part has a time that is no finite number, or does not end after its beginning."""
+    from_s, to_s = part_s or (None, None)
+    for option_name, time_s in (("--from", from_s), ("--to", to_s)):
+        if time_s is not None and not math.isfinite(time_s):
+            raise RecordError(
+                f"{path}: {option_name} {time_s:g} s must be a time since the session's start, 0 "
+                "or more."
+            )
+    if from_s is not None and to_s is not None and not from_s < to_s:
+        raise RecordError(
+            f"{path}: the part from {from_s:g} to {to_s:g} s is empty; --from must be less than "
+            "--to."
+        )
 
 
 def _contains_part(ticks: NDArray[np.int64], part_s: PartOption, rate_hz: float) -> bool:

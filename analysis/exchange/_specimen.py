@@ -55,6 +55,10 @@ _UNUSED_SECTIONS: Final = (
 """Other sections of a profile. The parts of installed packages may have further ones."""
 
 
+_LEAST_BEAM_NUMBER: Final = 1e-9
+"""Least length, density and stiffness of a beam in their units; the inverse is the largest."""
+
+
 @dataclass(frozen=True, slots=True)
 class SpecimenFile:
     """Beam, clamp and uncertainties of an imported record's specimen, as a file states them.
@@ -207,11 +211,16 @@ def _remedy(section_name: str, unknown_key: str) -> str:
 
 
 def _positive_number(path: Path, section: Mapping[str, Any], key: str) -> float:
-    """Return a positive number of the beam; raise if it is missing or not positive."""
+    """Return a positive number of the beam; raise if it is missing, or not positive and usual."""
     number = _required_number(path, "beam", section, key)
     if not number > 0.0:
         raise ExchangeError(
             f"{path}: beam.{key} is {number:g} {unit_of(key)}, but must be positive."
+        )
+    if not _LEAST_BEAM_NUMBER <= number <= 1 / _LEAST_BEAM_NUMBER:
+        raise ExchangeError(
+            f"{path}: beam.{key} is {number:g} {unit_of(key)}, but must lie between "
+            f"{_LEAST_BEAM_NUMBER:g} and {1 / _LEAST_BEAM_NUMBER:g}."
         )
     return number
 

@@ -155,6 +155,19 @@ def test_impossible_export_is_explained(analyze, session, tmp_path, out, options
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        (("--from", "nan"), "--from nan s must be a time since the session's start"),
+        (("--from", "7", "--to", "5"), "from 7 to 5 s is empty; --from must be less than --to.\n"),
+    ],
+)
+def test_a_part_without_time_is_refused(analyze, session, tmp_path, limits, words):
+    result = analyze("export", "record", session, tmp_path / "a.csv", *limits)
+    assert result.exit_code == 1
+    assert words in result.stderr
+
+
 def test_messages_of_the_analysis_are_those_of_an_export(analyze, session, tmp_path):
     result = analyze("export", "frf", session, tmp_path / "f.csv")
     assert result.exit_code == 1

@@ -394,6 +394,8 @@ def test_the_uniformity_of_the_specimen_goes_into_the_session(
         ("[beam]\nlength_m = true", ("beam.length_m is True",)),
         ("[beam]\nlength_m = 0", ("beam.length_m is 0 m", "positive")),
         ("[beam]\nlength_m = nan", ("beam.length_m is nan",)),
+        ("[beam]\nlength_m = 1e300", ("beam.length_m is 1e+300 m", "between 1e-09 and 1e+09")),
+        ("[beam]\nlength_m = 1e-300", ("beam.length_m is 1e-300 m", "between")),
         ("[beam]\nlength_m = {value = 1}\ndensity_kg_per_m = {}", ("beam.density_kg_per_m",)),
         (
             "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
