@@ -8,6 +8,8 @@ complex values, or write abscissae with only six digits.
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -45,6 +47,14 @@ _MAX_DATA_SETS: Final = 10_000
 """Largest number of data sets in a file that is read."""
 _SET_DELIMITER: Final = b"    -1"
 """Line that begins and ends each data set."""
+_BINARY_HEADER_PATTERN: Final = re.compile(rb"^ {4}-1 *\r?\n {4}58b +\d+ +(\d+)", re.MULTILINE)
+"""Pattern of the beginning of a binary data set, with the format of its numbers."""
+_NUMBER_FORMAT_NAMES: Final = {1: "DEC VMS", 3: "IBM 370"}
+"""Names of formats of binary numbers other than IEEE 754, by their codes."""
+_UNITS_SET_TYPE: Final = 164
+"""Type of the data set that states the units of a file."""
+_SI_UNITS_CODE: Final = 1
+"""Code of SI units in that data set."""
 _TIME_AXIS_CODE: Final = 17
 """Code of a time axis; its unit is the second in every system of units."""
 _RELATIVE_STEP_TOLERANCE: Final = 1e-3
@@ -76,8 +86,9 @@ def _read_channels(
     path: Path, channel_names: Sequence[str], open_file: Callable[[str], Any]
 ) -> dict[str, SourceChannel]:
     """Return the requested channels from their data sets."""
-    _check_set_count(path)
+    _check_sets(path)
     uff_file = open_file(str(path))
+    units_remark = _units_remark(uff_file)
     channel_set_numbers = [
         set_number for set_number, set_type in enumerate(uff_file.get_set_types()) if set_type == 58
     ]
@@ -101,6 +112,8 @@ def _read_channels(
         channels[channel_name] = _source_channel(
             path, channel_name, data_set, set_abscissae, is_time_requested=ABSCISSA in channel_names
         )
+        if not channels[channel_name].unit_label:
+            channels[channel_name] = replace(channels[channel_name], remark=units_remark)
         abscissae.append(set_abscissae)
         abscissa_units.append(_abscissa_unit(data_set))
     if ABSCISSA in channel_names:
@@ -114,13 +127,42 @@ def _read_channels(
     return channels
 
 
-def _check_set_count(path: Path) -> None:
-    """Raise if a file has too many data sets; pyuff would store the position of each."""
-    if path.read_bytes().count(_SET_DELIMITER) > 2 * _MAX_DATA_SETS:
+def _check_sets(path: Path) -> None:
+    """Raise if a file has too many data sets, or numbers that pyuff does not decode.
+
+    pyuff would store the position of each data set, and decodes all binary numbers by IEEE 754.
+    """
+    file_bytes = path.read_bytes()
+    if file_bytes.count(_SET_DELIMITER) > 2 * _MAX_DATA_SETS:
         raise ExchangeError(
             f"{path}: has more than {_MAX_DATA_SETS} data sets; export the session's channels "
             "alone."
         )
+    for binary_header in _BINARY_HEADER_PATTERN.finditer(file_bytes):
+        number_format = int(binary_header[1])
+        if number_format not in (0, 2):
+            raise ExchangeError(
+                f"{path}: a binary data set has numbers of format {number_format}"
+                f"{_code_name_suffix(number_format, _NUMBER_FORMAT_NAMES)}, which is not read; "
+                "export the file as text, or with numbers by IEEE 754."
+            )
+
+
+def _units_remark(uff_file: Any) -> str:  # noqa: ANN401
+    """Return a remark on the units that data set 164 states; empty if they are SI or unknown."""
+    for set_number, set_type in enumerate(uff_file.get_set_types()):
+        if set_type != _UNITS_SET_TYPE:
+            continue
+        units_set = uff_file.read_sets(set_number)
+        has_si_factors = (units_set["length"], units_set["force"]) == (1.0, 1.0)
+        if units_set["units_code"] == _SI_UNITS_CODE or has_si_factors:
+            continue
+        description = printable(str(units_set["units_description"]).strip(), 40)
+        return (
+            f"Data set {_UNITS_SET_TYPE} of the file states the units '{description}', and not "
+            "every channel states its own; such channels were read in the units as stated."
+        )
+    return ""
 
 
 def _source_channel(
@@ -151,6 +193,13 @@ def _source_channel(
     unit_s = time_unit_s(abscissa_unit)
     is_time_axis = unit_s is not None or data_set["abscissa_spec_data_type"] == _TIME_AXIS_CODE
     is_evenly_spaced = data_set["abscissa_spacing"] == 1
+    # A step of 1 without a unit may count samples.
+    may_be_times = (
+        not is_time_axis
+        and not abscissa_unit
+        and data_set["func_type"] == _TIME_RESPONSE
+        and not (is_evenly_spaced and data_set["abscissa_inc"] == 1.0)
+    )
     start_s = float(set_abscissae[0]) * (unit_s or 1.0) if len(set_abscissae) else math.nan
     unit_label = _label_text(data_set, "ordinate_axis_units_lab")
     return SourceChannel(
@@ -161,7 +210,7 @@ def _source_channel(
         else None,
         start_ns=round(start_s * 1e9) if math.isfinite(start_s) else None,
         times=FileTimes(ABSCISSA, set_abscissae, unit_s)
-        if is_time_axis and not is_evenly_spaced and not is_time_requested
+        if ((is_time_axis and not is_evenly_spaced) or may_be_times) and not is_time_requested
         else None,
         title=str(data_set["id1"]).strip(),
     )

@@ -409,6 +409,33 @@ def test_real_functions_of_frequency_are_refused(tmp_path, kind, axis, unit, wor
     assert words in refused(path, "a")
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_uff_binary_numbers_other_than_ieee_are_refused(tmp_path):
+    x = np.arange(4) * 1e-3
+    path = uff_of(tmp_path / "a.uff", ("a", x, x, {"binary": 1}))
+    content = path.read_bytes()
+    assert values(path, "a").tolist() == x.tolist()
+    path.write_bytes(content.replace(b"    58b     1     2", b"    58b     1     1"))
+    assert "format 1 (DEC VMS), which is not read" in refused(path, "a")
+
+
+def test_uff_time_response_without_axis_type_states_its_times(tmp_path):
+    x = np.arange(4) * 2e-3
+    path = uff_of(tmp_path / "a.uff", ("a", x, x, {}))
+    lines = path.read_text().splitlines(keepends=True)
+    lines[9] = f"{0:10d}{lines[9][10:47]}{'NONE':20}\n"
+    units = f"{164:6d}\n{5:10d}{'mm (milli-newton)':20}{2:10d}\n" + (
+        "  1.0000000000000000D+03  1.0000000000000000D+03  1.0000000000000000D+00\n"
+        "  2.7314999999999998D+02\n"
+    )
+    path.write_text(f"{-1:6d}\n{units}{-1:6d}\n" + "".join(lines))
+    channel = read_source(path, ["a"])[1]["a"]
+    np.testing.assert_allclose(channel.times.values, x)
+    assert channel.times.unit_s is None
+    assert "the units 'mm (milli-newton)'" in channel.remark
+
+
 def test_uff_other_than_functions_of_time_is_refused(tmp_path):
     x = np.arange(4) * 1e-3
     path = uff_of(
