@@ -84,7 +84,7 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
             session_paths.append(path)
             continue
         folder_sessions = sorted(
-            session_file for session_file in path.glob("*.mcap") if session_file.is_file()
+            session_file for session_file in path.glob("*.mcap") if not session_file.is_dir()
         )
         if not folder_sessions:
             has_incomplete_session = any(path.glob("*.mcap.part"))

@@ -125,7 +125,11 @@ def read_row(
     from rigd.session import SessionAccessError, SessionError, read_summary
     from rigd.session.user_metadata import added_metadata
 
-    file_bytes = path.stat().st_size
+    try:
+        file_bytes = path.stat().st_size
+    except OSError:
+        path.lstat()  # raises if no such name exists, unlike for a link to a disk that is absent
+        file_bytes = 0
     session_id = path.name.removesuffix(INCOMPLETE_SUFFIX).removesuffix(SESSION_SUFFIX)
     modes_and_validity: dict[str, Any] = _read_modes_and_validity(quick_look_path, report_folder)
     if report_folder is not None and (report_folder / REPORT_PAGE).is_file():
@@ -133,7 +137,7 @@ def read_row(
     try:
         file_summary = read_summary(path)
     except SessionError as error:
-        path.stat()  # raises if the file no longer exists
+        path.lstat()  # raises if the file no longer exists
         row = SessionRow(
             session_id,
             path,

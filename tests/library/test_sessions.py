@@ -93,7 +93,7 @@ def test_truncated_and_other_files_are_listed_with_their_error(record_briefly, t
     (tmp_path / "beside.txt").touch()
     rows = {row.path.name: row for row in list_sessions(tmp_path)}
     assert rows.keys() == {
-        "good.mcap", "torn.mcap.part", "text.mcap", "empty.mcap", "folder.mcap"
+        "good.mcap", "torn.mcap.part", "text.mcap", "empty.mcap", "folder.mcap", "dangling.mcap"
     }  # fmt: skip
     assert rows["good.mcap"].problem == ""
     assert (rows["torn.mcap.part"].outcome, rows["torn.mcap.part"].specimen) == (
@@ -102,7 +102,7 @@ def test_truncated_and_other_files_are_listed_with_their_error(record_briefly, t
     assert "rigd recover" in rows["torn.mcap.part"].problem
     assert rows["torn.mcap.part"].recorded is None
     assert rows["torn.mcap.part"].id == "torn"
-    for name in ("text.mcap", "empty.mcap", "folder.mcap"):
+    for name in ("text.mcap", "empty.mcap", "folder.mcap", "dangling.mcap"):
         assert rows[name].outcome == "unreadable"
         assert name in rows[name].problem
 

@@ -425,6 +425,10 @@ def test_folder_means_its_sessions(tmp_path, monkeypatch):
     refused = CliRunner().invoke(app, [str(folder)])
     assert refused.exit_code == 1
     assert f"{folder}: there is no session" in refused.stderr
+    (folder / "elsewhere.mcap").symlink_to("unmounted/elsewhere.mcap")
+    assert CliRunner().invoke(app, [str(folder)]).exit_code == 0
+    assert analysed.pop() == [folder / "elsewhere.mcap"]  # its reader names what is wrong
+    (folder / "elsewhere.mcap").unlink()
     assert "rigd recover" in refused.stderr
     for name in ("b.mcap", "a.mcap"):
         (folder / name).touch()
