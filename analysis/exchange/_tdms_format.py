@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import struct
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
@@ -39,6 +40,10 @@ _EARLIEST_START_NS: Final = int(_EARLIEST_START_TIME.astype("datetime64[ns]").as
 
 _LEAD_IN_BYTES: Final = 28
 """Number of bytes of a segment's lead-in."""
+_SEGMENT_TAG: Final = b"TDSm"
+"""First bytes of a segment."""
+_NEXT_SEGMENT_PATTERN: Final = re.compile(rb"TDSm.{4}[\x68\x69]\x12\x00\x00", re.DOTALL)
+"""Pattern of the first bytes of a segment with a known version."""
 _HAS_METADATA, _NEW_LIST, _BIG_ENDIAN = 1 << 1, 1 << 2, 1 << 6
 """Bits in the lead-in: the segment has metadata, a new list of channels, big-endian numbers."""
 
@@ -66,6 +71,15 @@ def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel
                     for channel in tdms_group.channels()
                 }
                 is_cut_off = tdms_file.file_status.incomplete_final_segment
+                # The file_status of npTDMS shows this of the last segment only.
+                if any(
+                    segment.final_chunk_lengths_override is not None
+                    and not segment.segment_incomplete
+                    for segment in tdms_file._reader._segments
+                ):
+                    raise _damaged_error(
+                        path, "the data of a segment are not as long as its channels"
+                    )
                 source_channels = {
                     channel_name: _read_channel(path, channel_name, channels_by_name, is_cut_off)
                     for channel_name in channel_names
@@ -89,14 +103,11 @@ def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel
     except (ExchangeError, OSError, MemoryError):
         raise
     except Exception as error:  # npTDMS raises many types on a damaged file
-        raise ExchangeError(
-            f"{path}: is not a TDMS file, or is damaged ({error}); copy it again from where it was "
-            "recorded."
-        ) from error
+        raise _damaged_error(path, str(error)) from error
 
 
 def _check_listed_channel_count(path: Path, stream: BinaryIO) -> None:
-    """Raise if the table of contents would take minutes or gigabytes to read."""
+    """Raise if the table of contents would take minutes or gigabytes to read, or is damaged."""
     file_size_bytes = path.stat().st_size
     segment_offset = total_channels = listed_count = 0
     while (
@@ -106,7 +117,19 @@ def _check_listed_channel_count(path: Path, stream: BinaryIO) -> None:
         lead_in = stream.read(_LEAD_IN_BYTES + 4)
         contents_mask = int.from_bytes(lead_in[4:8], "little")
         byte_order = ">" if contents_mask & _BIG_ENDIAN else "<"
-        (segment_bytes,) = struct.unpack(f"{byte_order}Q", lead_in[12:20])
+        segment_bytes, metadata_bytes = struct.unpack(f"{byte_order}QQ", lead_in[12:28])
+        if lead_in[:4] != _SEGMENT_TAG:
+            raise _damaged_error(path, f"no segment begins at byte {segment_offset}")
+        if segment_offset + _LEAD_IN_BYTES + segment_bytes > file_size_bytes:
+            stream.seek(segment_offset + _LEAD_IN_BYTES)
+            if _NEXT_SEGMENT_PATTERN.search(stream.read()):
+                raise _damaged_error(
+                    path, f"the segment at byte {segment_offset} states a wrong length"
+                )
+        if metadata_bytes > segment_bytes or (metadata_bytes and not contents_mask & _HAS_METADATA):
+            raise _damaged_error(
+                path, f"the segment at byte {segment_offset} states a wrong position of its data"
+            )
         if contents_mask & _HAS_METADATA and len(lead_in) == _LEAD_IN_BYTES + 4:
             (channel_count,) = struct.unpack(f"{byte_order}L", lead_in[_LEAD_IN_BYTES:])
             total_channels = (
@@ -121,6 +144,14 @@ def _check_listed_channel_count(path: Path, stream: BinaryIO) -> None:
             f"{path}: its segments list more than {_MAX_LISTED_CHANNELS} channels in all, so it is "
             "damaged or no record of a few channels; export the session's channels alone."
         )
+
+
+def _damaged_error(path: Path, problem: str) -> ExchangeError:
+    """Return the error for a file that states positions where its data cannot be."""
+    return ExchangeError(
+        f"{path}: is not a TDMS file, or is damaged ({problem}); copy it again from where it was "
+        "recorded."
+    )
 
 
 def _read_channel(

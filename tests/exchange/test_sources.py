@@ -332,6 +332,19 @@ def test_truncated_tdms_is_reported_without_using_another_index(tdms, tmp_path):
     assert "cut off" in channels["Rig/Angle"].remark
 
 
+@pytest.mark.parametrize(("offset", "bit"), [(20, 0x08), (21, 0x01), (15, 0x10)])
+def test_tdms_with_a_wrong_position_of_its_data_is_refused(tdms, tmp_path, offset, bit):
+    path = tmp_path / "a.tdms"
+    with tdms.TdmsWriter(str(path)) as writer:
+        for numbers in (np.arange(500.0), np.arange(600.0)):
+            channels = [tdms.ChannelObject("Rig", name, numbers) for name in ("Angle", "Torque")]
+            writer.write_segment(channels)
+    content = bytearray(path.read_bytes())
+    content[offset] ^= bit
+    path.write_bytes(content)
+    assert "is damaged (" in refused(path, "Rig/Angle")
+
+
 def test_nonnumeric_tdms_channel_is_refused(tdms, tmp_path):
     path = tmp_path / "a.tdms"
     with tdms.TdmsWriter(str(path)) as writer:
