@@ -5,6 +5,7 @@ from ._locations import WORKING_FOLDER as WORKING_FOLDER
 from ._locations import profile_files as profile_files
 from ._locations import specimen_files as specimen_files
 from ._locations import user_folder as user_folder
+from ._schema import SECTIONS as SECTIONS
 from ._schema import Profile as Profile
 from ._schema import RealtimeSettings as RealtimeSettings
 from ._schema import check_part_plugin as check_part_plugin

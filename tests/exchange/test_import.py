@@ -3,7 +3,7 @@
 import hashlib
 import os
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from analysis.exchange import (
 )
 from analysis.record import load_record
 from rigd.beam import Beam, Damping, transfer
+from rigd.profile import SECTIONS
 from rigd.session import SessionError, SessionExistsError, read_session
 from rigd.session.layout import Status
 
@@ -360,6 +361,22 @@ def test_a_profile_may_have_sections_of_installed_packages(profile, tmp_path):
         text = shipped.read_text(encoding="utf-8")
         path.write_text(f"{text}\n[netft]\nhost = 'box'\n", encoding="utf-8")
         assert read_specimen(path).beam.length_m > 0.0
+
+
+def test_an_import_knows_every_section_and_key_of_a_profile(tmp_path):
+    path = tmp_path / "rig.toml"
+    beam = {"length_m": 1.0, "density_kg_per_m": 5e-3, "bending_stiffness_n_m2": 0.1}
+    for section, settings in SECTIONS.items():
+        for key in fields(settings):
+            document = {"beam": beam.copy()}
+            document.setdefault(section, {}).setdefault(key.name, 0.01)
+            path.write_text(
+                "".join(
+                    f"[{name}]\n" + "".join(f"{k} = {value}\n" for k, value in values.items())
+                    for name, values in document.items()
+                )
+            )
+            assert read_specimen(path).beam.length_m == 1.0, f"{section}.{key.name}"
 
 
 def test_tip_mass_and_tilt_of_a_profile_go_into_the_session(csv_of, make_plan, tmp_path):
