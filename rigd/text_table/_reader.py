@@ -512,7 +512,7 @@ def _blank_lines_remark(row_reader: _NumberRowReader) -> str:
 def _find_times_column_index(layout: TableLayout, first_lines: Sequence[str]) -> int | None:
     """Return the index of a column of times that is not requested; None if there is none.
 
-    Of several columns by title or unit, it is the first whose values in the first lines increase.
+    If several columns have such a title or unit, it is the first whose values increase at first.
     """
     candidate_indices = [
         column_index

@@ -99,7 +99,7 @@ def stated_unit_of(title: str) -> str:
 def unit_in_brackets(title: str) -> str:
     """Return the known unit in brackets in a title such as ``Angle [deg] CH1``; "" if none.
 
-    Of several units, the one at the end is returned, or else the first.
+    If there are several units, return the one at the end, or else the first.
     """
     known_units = [
         (brackets[1].strip(), brackets.end())
