@@ -23,3 +23,4 @@ from ._statistics import NominalModel as NominalModel
 from ._statistics import RankedStructure as RankedStructure
 from ._statistics import best_models as best_models
 from ._validation import group_errors_by_model as group_errors_by_model
+from ._welch_bias import MAX_REFERENCE_MISFIT as MAX_REFERENCE_MISFIT

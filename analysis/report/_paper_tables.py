@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns import best_models
-from analysis.campaigns._welch_bias import MAX_REFERENCE_MISFIT
+from analysis.campaigns import MAX_REFERENCE_MISFIT, best_models
 from analysis.campaigns.specimen_sentences import pooled_title
 from analysis.models import STRUCTURES, estimator_text
 from analysis.report.table import (
