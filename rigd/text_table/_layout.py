@@ -497,7 +497,7 @@ def _is_row_of_numbers(
     return not any(
         cell
         and not _is_value(cell)
-        and _begins_with_numbers_or_ends_in_them(
+        and _are_numbers_below(
             [row.cells[column_index] if column_index < len(row.cells) else "" for row in rows_below]
         )
         for column_index, cell in enumerate(row_cells)
@@ -509,8 +509,8 @@ def _is_value(cell: str) -> bool:
     return is_any_number(cell) or is_stamp(cell)
 
 
-def _begins_with_numbers_or_ends_in_them(cells: Sequence[str]) -> bool:
-    """Return whether the first cell is a number, or all cells are from the first number on."""
+def _are_numbers_below(cells: Sequence[str]) -> bool:
+    """Return whether cells below a text are numbers: the first, or all from the first number."""
     cells_from_value = list(dropwhile(lambda cell: not _is_value(cell), cells))
     return bool(cells_from_value) and (
         len(cells_from_value) == len(cells) or all(map(_is_value, cells_from_value))
