@@ -1,9 +1,9 @@
 """Layout of a table: separator, titles, row of units, and the first line of numbers."""
 
 import csv
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import dropwhile, islice, takewhile
+from itertools import takewhile
 from typing import Final
 
 from rigd.text_table import _labview
@@ -13,18 +13,28 @@ from rigd.text_table._cells import (
     is_comment_row,
     is_date,
     is_row_of_units,
-    without_comment_mark,
 )
 from rigd.text_table._errors import MissingColumnError, TableError
 from rigd.text_table._head_rates import stated_rate_hz
-from rigd.text_table._stamps import is_stamp
+from rigd.text_table._rows import (
+    BLANK_SEPARATOR,
+    TextRow,
+    has_number,
+    has_titles,
+    is_row_of_column_numbers,
+    is_row_of_numbers,
+    is_value,
+    row_after,
+    rows_after,
+    rows_of_cells,
+    titles_in_row,
+    without_trailing_empty_cells,
+)
 from rigd.text_table.titles import bare_unit, is_unit, stated_unit_of, titles_by_units
 
 MAX_HEAD_LINES: Final = 500
 """Number of lines at the beginning of a file that are searched for the first line of numbers."""
 
-BLANK_SEPARATOR: Final = " "
-"""Separator that means any number of blanks."""
 _SEPARATORS: Final = ("\t", ";", ",", "|")
 """Characters that may separate cells, without blanks."""
 _SEPARATOR_NAMES: Final = {
@@ -39,30 +49,6 @@ _EXCEL_SEPARATOR_LINE: Final = "sep="
 """Beginning of the line with which Excel states the separator."""
 _MAX_LINES_BELOW_TITLES: Final = 6
 """Largest number of lines between the titles and the first line of numbers."""
-_TEXT_CHECK_ROWS: Final = 20
-"""Number of rows below a row with texts that are read to decide whether it belongs to the
-numbers."""
-_NUMBERING_CHECK_ROWS: Final = 5
-"""Number of rows below a row 1, 2, 3, … that are read to decide whether it numbers the columns."""
-
-
-@dataclass(frozen=True, slots=True)
-class TextRow:
-    """Row of cells: one line of a file, or several lines if quoted cells contain line breaks.
-
-    Attributes
-    ----------
-    line_number : int
-        Number of the row's first line, from 1.
-    cells : list of str
-        Texts of the cells without surrounding blanks.
-    row_index : int
-        Number of rows before this one, including empty rows.
-    """
-
-    line_number: int
-    cells: list[str]
-    row_index: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,27 +102,6 @@ def stated_separator(first_line: str) -> str | None:
         and len(line_text) == len(_EXCEL_SEPARATOR_LINE) + 1
     )
     return line_text[-1] if is_separator_statement else None
-
-
-def rows_of_cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of a text: number of the row's first line, and its cells."""
-    if separator == BLANK_SEPARATOR:
-        for line_number, row_cells in enumerate(lines, 1):
-            yield line_number, row_cells.split()
-        return
-    csv_reader = csv.reader(lines, delimiter=separator)
-    lines_before_row = 0
-    for row in csv_reader:
-        yield lines_before_row + 1, row
-        lines_before_row = csv_reader.line_num
-
-
-def without_trailing_empty_cells(row: Sequence[str], column_count: int) -> list[str]:
-    """Return a row without the empty cells that follow the last column."""
-    row_cells = list(row)
-    while len(row_cells) > column_count and not row_cells[-1].strip():
-        row_cells.pop()
-    return row_cells
 
 
 def wrong_width_message(
@@ -290,7 +255,7 @@ def _layout_with_separator(
         raise _NotThisTableError(_RANK_NO_ROWS, TableError("has no lines below its header."))
     first_failure: _NotThisTableError | None = None
     for row_index, row in enumerate(rows):
-        if requested_titles and not _has_titles(row, requested_titles):
+        if requested_titles and not has_titles(row, requested_titles):
             continue
         try:
             if requested_titles:
@@ -330,28 +295,6 @@ def _column_number(column_name: str) -> int | None:
     )
 
 
-def _plain_titles(row: TextRow) -> list[str]:
-    """Return the titles in a row without a leading comment mark and trailing empty titles."""
-    title_cells = without_trailing_empty_cells(row.cells, 0)
-    if title_cells and title_cells[0] in (
-        "#",
-        "%",
-    ):  # with blanks as separator the mark is a separate cell
-        return title_cells[1:]
-    return [
-        without_comment_mark(cell) if not cell_index else cell
-        for cell_index, cell in enumerate(title_cells)
-    ]
-
-
-def _has_titles(row: TextRow, requested_titles: Iterable[str]) -> bool:
-    """Return whether a row contains all of the requested titles."""
-    return all(
-        requested_title in row.cells or requested_title in _plain_titles(row)
-        for requested_title in requested_titles
-    )
-
-
 def _layout_below_titles(
     rows: Sequence[TextRow],
     titles_row_index: int,
@@ -363,7 +306,7 @@ def _layout_below_titles(
     titles_row = rows[titles_row_index]
     raw_titles, plain_titles = (
         without_trailing_empty_cells(titles_row.cells, 0),
-        _plain_titles(titles_row),
+        titles_in_row(titles_row),
     )
     titles = (
         raw_titles
@@ -376,7 +319,7 @@ def _layout_below_titles(
     )
     # "#" or "%" alone may mark a comment or be the title of an index.
     if len(plain_titles) < len(raw_titles):
-        next_row = _row_after(rows, titles_row)
+        next_row = row_after(rows, titles_row)
         titles = (
             raw_titles
             if next_row is None or len(next_row.cells) == len(raw_titles)
@@ -416,9 +359,7 @@ def _layout_below_titles(
     for row in rows[titles_row_index + 1 : titles_row_index + 2 + _MAX_LINES_BELOW_TITLES]:
         row_cells = without_trailing_empty_cells(row.cells, column_count)
         has_table_width = column_count - optional_column_count <= len(row_cells) <= column_count
-        if has_table_width and _is_row_of_numbers(
-            row_cells, column_indices, _rows_after(rows, row)
-        ):
+        if has_table_width and is_row_of_numbers(row_cells, column_indices, rows_after(rows, row)):
             _check_single_column(row.line_number, row_cells)
             return TableLayout(
                 separator=separator,
@@ -467,56 +408,6 @@ def comma_in_single_message(line_number: int) -> str:
     )
 
 
-def _row_after(rows: Sequence[TextRow], earlier_row: TextRow) -> TextRow | None:
-    """Return the row after a given one; None if it is the last."""
-    return next(iter(_rows_after(rows, earlier_row)), None)
-
-
-def _rows_after(rows: Sequence[TextRow], earlier_row: TextRow) -> Sequence[TextRow]:
-    """Return the rows after a given one, at most `_TEXT_CHECK_ROWS`."""
-    later_rows = (row for row in rows if row.row_index > earlier_row.row_index)
-    return list(islice(later_rows, _TEXT_CHECK_ROWS))
-
-
-def _is_row_of_numbers(
-    row_cells: Sequence[str], column_indices: Sequence[int], rows_below: Sequence[TextRow]
-) -> bool:
-    """Return whether a row is one of the table's rows of numbers.
-
-    It must have numbers in the requested columns, and no text at the head of a column of numbers.
-    """
-    if max(column_indices) >= len(row_cells):
-        return False
-    requested_cells = [
-        row_cells[column_index] for column_index in column_indices if row_cells[column_index]
-    ]
-    if not all(map(_is_value, requested_cells)):
-        return False
-    if not any(map(is_any_number, row_cells)):
-        return False
-    return not any(
-        cell
-        and not _is_value(cell)
-        and _are_numbers_below(
-            [row.cells[column_index] if column_index < len(row.cells) else "" for row in rows_below]
-        )
-        for column_index, cell in enumerate(row_cells)
-    )
-
-
-def _is_value(cell: str) -> bool:
-    """Return whether a cell is a number or a time stamp."""
-    return is_any_number(cell) or is_stamp(cell)
-
-
-def _are_numbers_below(cells: Sequence[str]) -> bool:
-    """Return whether cells below a text are numbers: the first, or all from the first number."""
-    cells_from_value = list(dropwhile(lambda cell: not _is_value(cell), cells))
-    return bool(cells_from_value) and (
-        len(cells_from_value) == len(cells) or all(map(_is_value, cells_from_value))
-    )
-
-
 def _error_for_unexpected_row(
     row: TextRow,
     row_cells: Sequence[str],
@@ -534,11 +425,7 @@ def _error_for_unexpected_row(
             )
         )
     for column_name, column_index in zip(requested_names, column_indices, strict=True):
-        if (
-            row_cells[column_index]
-            and not is_any_number(row_cells[column_index])
-            and not is_stamp(row_cells[column_index])
-        ):
+        if row_cells[column_index] and not is_value(row_cells[column_index]):
             return not_a_number_error(row.line_number, column_name, row_cells[column_index])
     return _texts_above_numbers_error(row)
 
@@ -585,18 +472,18 @@ def _layout_from_numbers(
     column_indices = [number - 1 for number in column_numbers]
     if is_comment_row(row.cells):
         return None
-    if not _is_row_of_numbers(
-        row.cells, column_indices, _rows_after(rows, row)
-    ) or _is_row_of_column_numbers(rows, row_index):
+    if not is_row_of_numbers(
+        row.cells, column_indices, rows_after(rows, row)
+    ) or is_row_of_column_numbers(rows, row_index):
         filled_column_indices = [c for c in column_indices if c < len(row.cells) and row.cells[c]]
         number_column_indices = [c for c in filled_column_indices if is_any_number(row.cells[c])]
-        row_below = _row_after(rows, row)
+        row_below = row_after(rows, row)
         if (
             number_column_indices
             and len(number_column_indices) < len(filled_column_indices)
             and row_below is not None
             and len(row_below.cells) == len(row.cells)
-            and not _is_row_of_column_numbers(rows, row_index)
+            and not is_row_of_column_numbers(rows, row_index)
         ):
             column_index = next(c for c in filled_column_indices if c not in number_column_indices)
             raise _NotThisTableError(
@@ -622,8 +509,8 @@ def _layout_from_numbers(
     optional_column_count = 0
     if rows_above and len(row.cells) == 1:
         titles, titles_line_number = _title_of_single_column(rows_above)
-    elif rows_above and len(_plain_titles(rows_above[-1])) > 1:
-        titles, titles_line_number = _plain_titles(rows_above[-1]), rows_above[-1].line_number
+    elif rows_above and len(titles_in_row(rows_above[-1])) > 1:
+        titles, titles_line_number = titles_in_row(rows_above[-1]), rows_above[-1].line_number
         optional_column_count = int(
             labview_head is not None and titles[-1:] == [_labview.COMMENT_COLUMN_TITLE]
         )
@@ -666,16 +553,11 @@ def _layout_from_numbers(
 
 def _check_rows_below_titles(rows_above: Sequence[TextRow], column_indices: Sequence[int]) -> None:
     """Raise if a row above the numbers, such as settings or statistics, is below the titles."""
-    if len(rows_above) < 2 or not _has_number(rows_above[-1], column_indices):
+    if len(rows_above) < 2 or not has_number(rows_above[-1], column_indices):
         return
     for row in rows_above[:-1]:
-        if len(row.cells) == len(rows_above[-1].cells) and not _has_number(row, column_indices):
+        if len(row.cells) == len(rows_above[-1].cells) and not has_number(row, column_indices):
             raise _NotThisTableError(_RANK_ALL_TITLES, _texts_above_numbers_error(rows_above[-1]))
-
-
-def _has_number(row: TextRow, column_indices: Sequence[int]) -> bool:
-    """Return whether a row has a number in one of the columns."""
-    return any(is_any_number(row.cells[c]) for c in column_indices if c < len(row.cells))
 
 
 def _title_of_single_column(rows_above: Sequence[TextRow]) -> tuple[Sequence[str], int]:
@@ -685,7 +567,7 @@ def _title_of_single_column(rows_above: Sequence[TextRow]) -> tuple[Sequence[str
     of several words with a comment mark is a remark unless it names a unit.
     """
     for row in reversed(rows_above):
-        words = _plain_titles(row)
+        words = titles_in_row(row)
         title = " ".join(words).strip('"')
         if stated_rate_hz([title]) is not None:
             continue
@@ -705,28 +587,6 @@ def _title_of_single_column(rows_above: Sequence[TextRow]) -> tuple[Sequence[str
     return (), 0
 
 
-def _is_row_of_column_numbers(text_rows: Sequence[TextRow], row_index: int) -> bool:
-    """Return whether a row is the first one and contains the column numbers instead of data.
-
-    This is the case if it counts from 0 or 1, and no row below contains only integers.
-    """
-    filled_cells = [cell for cell in text_rows[row_index].cells if cell]
-    if row_index or len(filled_cells) < 2:
-        return False
-    counts_upwards = any(
-        filled_cells == [str(first_number + n) for n in range(len(filled_cells))]
-        for first_number in (0, 1)
-    )
-    rows_below = text_rows[1 : 1 + _NUMBERING_CHECK_ROWS]
-    return (
-        counts_upwards
-        and bool(rows_below)
-        and not any(
-            all(cell.lstrip("+-").isdecimal() for cell in row.cells if cell) for row in rows_below
-        )
-    )
-
-
 def _missing_title_error(
     rows: Sequence[TextRow], requested_names: Sequence[str]
 ) -> _NotThisTableError:
@@ -737,13 +597,13 @@ def _missing_title_error(
 
     def count_found_names(row: TextRow) -> int:
         return sum(
-            requested_name in row.cells or requested_name in _plain_titles(row)
+            requested_name in row.cells or requested_name in titles_in_row(row)
             for requested_name in requested_names
         )
 
     likely_titles_row = max(rows, key=count_found_names)
     if count_found_names(likely_titles_row):
-        titles = _plain_titles(likely_titles_row)
+        titles = titles_in_row(likely_titles_row)
         missing_name = next(
             title
             for title in requested_names
@@ -764,17 +624,17 @@ def _missing_title_error(
     if row_index is None:
         return _NotThisTableError(
             _RANK_NO_ROWS,
-            MissingColumnError(requested_names[0], _plain_titles(rows[0]), rows[0].line_number),
+            MissingColumnError(requested_names[0], titles_in_row(rows[0]), rows[0].line_number),
         )
     column_count = len(rows[row_index].cells)
-    rows_above = [row for row in rows[:row_index] if len(_plain_titles(row)) == column_count]
+    rows_above = [row for row in rows[:row_index] if len(titles_in_row(row)) == column_count]
     if rows_above:
         likely_titles_row = (
             rows_above[-2]
             if len(rows_above) > 1 and is_row_of_units(rows_above[-1].cells, range(column_count))
             else rows_above[-1]
         )
-        titles, titles_line_number = _plain_titles(likely_titles_row), likely_titles_row.line_number
+        titles, titles_line_number = titles_in_row(likely_titles_row), likely_titles_row.line_number
     else:
         titles, titles_line_number = (
             [f"#{column_number}" for column_number in range(1, column_count + 1)],

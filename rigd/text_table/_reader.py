@@ -30,11 +30,10 @@ from rigd.text_table._layout import (
     comma_in_single_message,
     find_layout,
     not_a_number_error,
-    rows_of_cells,
     stated_separator,
-    without_trailing_empty_cells,
     wrong_width_message,
 )
+from rigd.text_table._rows import rows_of_cells, without_trailing_empty_cells
 from rigd.text_table._stamps import StampReader, is_stamp
 from rigd.text_table.titles import (
     are_times,
