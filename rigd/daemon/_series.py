@@ -56,6 +56,11 @@ class ServedSeries:
     """Whether the series failed, so that sessions are missing or incomplete."""
 
     @property
+    def session_key(self) -> tuple[int, int]:
+        """Numbers of the series and of its present session, which identify the session."""
+        return self.series_number, self.session_number
+
+    @property
     def description(self) -> str:
         """Description of the series' sessions for the operator, such as "chirp"."""
         return _EXCITATION_DESCRIPTIONS.get(self.request.excitation, self.request.excitation)
@@ -112,17 +117,23 @@ class SeriesReporter:
     """
 
     def __init__(
-        self, series: ServedSeries, publish: PublishEvent, can_receive_stop: Callable[[], bool]
+        self,
+        series: ServedSeries,
+        publish: PublishEvent,
+        can_receive_stop: Callable[[], bool],
+        reset_session_counts: Callable[[], None],
     ) -> None:
         self._series = series
         self._publish = publish
         self._can_receive_stop = can_receive_stop
+        self._reset_session_counts = reset_session_counts
 
     def on_start(self, session_number: int, session_path: Path) -> None:
         if not self._can_receive_stop():
             raise RigError(
                 "The daemon does not respond to requests: no further session is started."
             )
+        self._reset_session_counts()  # first: a status with this number is of this session
         self._series.session_number, self._series.session_path = session_number, session_path
         self._series.last_fit = None
 

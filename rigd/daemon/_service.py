@@ -39,7 +39,7 @@ from rigd.daemon._states import (
 from rigd.devices import ActuationTarget, describe_actuation_target
 from rigd.errors import UserError
 from rigd.profile import Profile
-from rigd.runner import ProbeFailedError, Rig, RigError, Series
+from rigd.runner import ProbeFailedError, Rig, RigError, RigStoppedError, Series
 from rigd.runner.quick_looks import QuickLook, QuickLookQueue
 from rigd.runner.request import remaining_file_text
 from rigd.runner.session import SessionFailedError
@@ -119,6 +119,8 @@ class Service:
         self._series_count = 0
         self._last_poll_s = inf
         self._rig_status: RigStatus | None = None
+        self._polled_session: tuple[int, int] | None = None
+        """Session that was present at the last poll of the status."""
         self._timed_message_counts: deque[tuple[float, dict[str, int]]] = deque(
             maxlen=_RATE_WINDOW_POLLS + 1
         )
@@ -249,6 +251,8 @@ class Service:
     def status(self) -> Document:
         """Return the status of daemon, rig and session as a dictionary for JSON."""
         served_series = self._series
+        if served_series is not None and served_series.session_key != self._polled_session:
+            self.poll_status()  # the last status shows the counts of the previous session
         rig_status = self._rig_status if self._rig.connected else None
         return {
             "daemon": daemon_document(
@@ -294,6 +298,7 @@ class Service:
 
     def poll_status(self) -> None:
         """Read the rig's status, and publish the progress of a running session."""
+        self._polled_session = None if self._series is None else self._series.session_key
         self._rig_status = rig_status = self._rig.status()
         if rig_status is None:
             self._timed_message_counts.clear()
@@ -423,6 +428,7 @@ class Service:
                 if plan_job.is_heavy
                 else self._call_in_worker(plan_job.perform)
             )
+            await self._call_in_worker(self._rig.reset_session_counts)
             if served_series.stop_request.requested or self._is_closing or self.controller != peer:
                 raise CommandError(_STOPPED_MESSAGE)
             refusal_text = self._state_machine.refusal_text("start")
@@ -553,24 +559,24 @@ class Service:
                 series.end_reason = last_result.reason
                 if last_result.fault:
                     fault_reason = last_result.reason
+                elif last_result.outcome == "stopped":
+                    series.stop_request.request()  # a signal may have stopped the control process
             elif series.stop_request.requested and session_count < series.request.repeat:
                 series.end_reason = (
                     f"Stopped after {session_count} of {series.request.repeat} sessions."
                     if session_count
                     else _STOPPED_MESSAGE
                 )
-        if not self._rig.connected:
-            fault_reason = (
-                fault_reason or series.end_reason or "The connection to the devices is lost."
-            )
+        series.has_failed = bool(
+            fault_reason or (series.end_reason and not series.stop_request.requested)
+        )
+        if not (self._rig.connected or self._is_closing or fault_reason):
+            fault_reason = str(RigStoppedError())
         try:
             self._publish_signals()  # the last signals are sent before the report of the end
         except Exception:
             _log.exception("the last signals could not be sent")
         series.is_running = False
-        series.has_failed = bool(
-            fault_reason or (series.end_reason and not series.stop_request.requested)
-        )
         self._state_machine.change_to(*series.state_after(fault_reason))
         self._publish({"event": "series", **series.as_document()})
 
@@ -589,7 +595,9 @@ class Service:
         def publish(event: Document) -> None:
             event_loop.call_soon_threadsafe(self._publish, event)
 
-        series_reporter = SeriesReporter(series, publish, self._can_receive_stop)
+        series_reporter = SeriesReporter(
+            series, publish, self._can_receive_stop, self._rig.reset_session_counts
+        )
         try:
             planned_series.run(
                 self._rig,

@@ -14,5 +14,6 @@ from ._probing import probe_in_foreground as probe_in_foreground
 from ._process_group import ProcessGroup as ProcessGroup
 from ._rig import Rig as Rig
 from ._rig import RigError as RigError
+from ._rig import RigStoppedError as RigStoppedError
 from ._series import Series as Series
 from ._tip_slope import with_tip_slope as with_tip_slope

@@ -59,6 +59,13 @@ class RigError(FailureError):
     """Raised if the rig cannot execute a request or its connection is lost; it states why."""
 
 
+class RigStoppedError(RigError):
+    """Raised if a stop signal, such as that of Ctrl-C, has ended the control process."""
+
+    def __init__(self) -> None:
+        super().__init__("The control process was asked to end.")
+
+
 class Rig:
     """The devices of one profile, operated by separate processes.
 
@@ -247,6 +254,11 @@ class Rig:
             # and a long series would take 4 kB more for each session.
             gc.collect()
 
+    def reset_session_counts(self) -> None:
+        """Reset what :meth:`status` states on the previous session; do this before the next one."""
+        if self._group is not None and self.connected:
+            _reset_session_fields(self._group.channels.shared_state)
+
     def show_session(self, session_order: SessionOrder, stop: StopRequest) -> str:
         """Prepare the live view for the next session, and return its address.
 
@@ -366,7 +378,7 @@ class Rig:
             probe_reply = group.control.poll(_POLL_INTERVAL_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
             if isinstance(probe_reply, ControlEnded):
-                raise RigError(probe_reply.reason or "It was stopped.")
+                raise _control_end_error(probe_reply)
             if probe_reply is not None:
                 return probe_reply
             now_s = time.monotonic()
@@ -404,10 +416,7 @@ class Rig:
             )
         if control_message is not None:
             self.disconnect()
-            loss_reason = (
-                control_message.reason if isinstance(control_message, ControlEnded) else ""
-            )
-            raise RigError(loss_reason or "The control process was asked to end.")
+            raise _control_end_error(control_message)
 
     def status(self) -> RigStatus | None:
         """Return the rig's present status, or None without connection; any thread may call this."""
@@ -506,7 +515,7 @@ class Rig:
                 "devices are on, and check CPU load."
             )
         if isinstance(control_message, ControlEnded):
-            raise RigError(control_message.reason or "It was stopped.")
+            raise _control_end_error(control_message)
         return control_message
 
     def _await_closed_devices(self) -> None:
@@ -515,6 +524,13 @@ class Rig:
         with contextlib.suppress(ChildError):
             self._group.control.poll(_MEASUREMENT_TIMEOUT_S)
         self.disconnect()
+
+
+def _control_end_error(control_message: object) -> RigError:
+    """Return the error that states why the control process has ended, from its last message."""
+    if isinstance(control_message, ControlEnded) and control_message.reason:
+        return RigError(control_message.reason)
+    return RigStoppedError()
 
 
 def _do_nothing_on_stop() -> None:

@@ -13,7 +13,7 @@ from rigd.devices import is_simulated_here, session_seed
 from rigd.engine.shared_state import LogEvent
 from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
-from rigd.runner._rig import Rig, RigError
+from rigd.runner._rig import Rig, RigError, RigStoppedError
 from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RefusedError, plan_document, plan_session, predicted_metadata
 from rigd.runner.quick_looks import QuickLookQueue
@@ -191,8 +191,8 @@ class Series:
         """
         try:
             probe_metadata = {} if stop.requested else self._probe_if_needed(rig, stop, listener)
-        except RigError:
-            if stop.requested and rig.connected:
+        except RigError as error:
+            if stop.requested and (rig.connected or isinstance(error, RigStoppedError)):
                 return  # the probing move was stopped, and nothing failed
             raise
         for session_number in range(1, self._session_count + 1):
@@ -273,6 +273,11 @@ def _await_quick_look(quick_looks: QuickLookQueue, rig: Rig, stop: StopRequest) 
     """Wait some seconds for the quick look at the previous session before the next session."""
     deadline_s = time.monotonic() + _QUICK_LOOK_MAX_PAUSE_S
     while quick_looks.is_busy and not stop.requested and time.monotonic() < deadline_s:
-        rig.check_control_process()
+        try:
+            rig.check_control_process()
+        except RigStoppedError:
+            if stop.requested:
+                return  # the signal was sent to both processes
+            raise
         quick_looks.poll()
         time.sleep(_POLL_INTERVAL_S)

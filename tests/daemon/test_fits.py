@@ -17,7 +17,7 @@ def reported_series():
     """A started series, its reporter, and the published events."""
     request = b'{"command": "start", "excitation": "chirp", "watch_fit": true}'
     series, events = ServedSeries(1, parse_request(request), is_running=True), []
-    reporter = SeriesReporter(series, events.append, lambda: True)
+    reporter = SeriesReporter(series, events.append, lambda: True, lambda: None)
     reporter.on_start(1, Path("1.mcap"))
     return series, reporter, events
 

@@ -7,6 +7,7 @@ import re
 import pytest
 from cases import further
 from operated_daemons import CommandError, Peer, parse_request, printed_status, shown_status
+from processes import eventually
 
 from rigd.devices import ActuationTarget
 from rigd.devices.contracts import DeviceError, LineHealth
@@ -344,6 +345,33 @@ def test_death_of_control_process_between_two_sessions_reports_no_missing_file(
     assert "file" not in operated.last["reason"]
 
 
+@pytest.mark.parametrize("closing", [True, False])
+def test_stop_signal_before_the_session_is_no_failure(operated, monkeypatch, closing):
+    """The control process gets the signal before its order, alone or with the whole daemon."""
+    run, closed = operated.rig.run, []
+
+    def close():
+        closed.append(operated.loop.create_task(operated.service.close("the daemon got SIGINT")))
+
+    def signal_and_run(*arguments):
+        if closing:
+            operated.loop.call_soon_threadsafe(close)
+            assert eventually(lambda: closed)
+        operated.rig._group.control.stop()
+        return run(*arguments)
+
+    monkeypatch.setattr(operated.rig, "run", signal_and_run)
+    operated.request("start", **SHORT, repeat=2)
+    (session,) = operated.last["sessions"]
+    assert (session["outcome"], session["path"]) == ("stopped", None)
+    assert (operated.last["stopped"], operated.last["failed"]) == (True, False)
+    if closing:
+        operated.loop.run_until_complete(closed[0])
+    assert operated.state == ("idle" if closing else "fault")
+    if not closing:
+        assert operated.service.status()["reason"] == "The control process was asked to end."
+
+
 def test_death_of_control_process_between_sessions_is_a_fault(operated):
     operated.rig._group.control.kill()
     for _ in range(100):
@@ -604,6 +632,25 @@ def test_status_has_progress_processes_and_topics(operated):
         ("idle", "ready"), ("ready", "running"),
     ]  # fmt: skip
     assert any(event["event"] == "progress" for event in operated.events)
+
+
+def test_status_never_shows_the_counts_of_the_previous_session(operated, monkeypatch):
+    """Between two polls, and before the session itself has begun."""
+    run, statuses = operated.rig.run, []
+
+    def record_status_and_run(*arguments):
+        statuses.append(operated.service.status())
+        return run(*arguments)
+
+    operated.world.countdown = 500
+    operated.world.then = lambda drive: operated.service.poll_status()
+    operated.request("start", **SHORT)
+    monkeypatch.setattr(operated.rig, "run", record_status_and_run)
+    operated.request("start", **SHORT, repeat=2)
+    assert [(status["progress"]["session"], status["progress"]["tick"]) for status in statuses] == [
+        (1, 0), (2, 0),
+    ]  # fmt: skip
+    assert [status["progress"]["phase"] for status in statuses] == ["off", "off"]
 
 
 def test_session_is_preparing_while_the_drive_is_off(operated):

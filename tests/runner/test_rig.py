@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 
 import pytest
-from processes import children
+from processes import children, eventually
 from shipped_profile import load_shipped
 
 from rigd.engine.shared_state import Phase
 from rigd.excitation import hold
-from rigd.runner import Rig, RigError
+from rigd.runner import Rig, RigError, RigStoppedError
 from rigd.runner.request import SessionOrder
 from rigd.runner.session import SessionFailedError
 from rigd.runtime import StopRequest
@@ -200,5 +200,14 @@ def test_death_of_the_recorder_ends_only_its_session(rig, run, tmp_path):
 def test_death_of_the_control_process_in_a_probing_move_asks_for_the_wired_stop(rig, profile):
     rig._group.control.kill()
     with pytest.raises(RigError, match=r"killed by signal 9.*press the wired stop \(STO\)"):
+        rig.probe(profile, StopRequest())
+    assert not rig.connected
+
+
+def test_probing_move_ended_by_a_stop_signal(rig, profile):
+    control = rig._group.control
+    os.kill(control.pid, signal.SIGINT)
+    assert eventually(lambda: not control.running)
+    with pytest.raises(RigStoppedError):
         rig.probe(profile, StopRequest())
     assert not rig.connected

@@ -11,7 +11,7 @@ from shipped_profile import load_shipped
 from rigd.engine.shared_state import Phase
 from rigd.excitation import hold, touch
 from rigd.profile import load_profile
-from rigd.runner import ProgressLine, Series, plan_lines, result_line
+from rigd.runner import ProgressLine, RigStoppedError, Series, plan_lines, result_line
 from rigd.runner.planning import RefusedError, RigPreview
 from rigd.runner.request import NoRoomError
 from rigd.runner.session import SessionResult
@@ -189,21 +189,46 @@ def test_quick_look_is_suspended_during_a_session(make_series):
 
 
 @pytest.mark.process
-def test_stop_ends_the_wait_for_a_quick_look(make_series):
+@pytest.mark.parametrize("signalled", ["supervisor", "both", "control"])
+def test_stop_ends_the_wait_for_a_quick_look(make_series, signalled):
     listener, stop = RecordingListener(), StopRequest()
 
     class StoppingRig(Rig):
         def check_control_process(self):
             listener.calls.append("watch")
-            stop.request()
+            if signalled != "control":
+                stop.request()
+            if signalled != "supervisor":
+                raise RigStoppedError
 
     queue = FakeQuickLookQueue(listener.calls)
     result = replace(COMPLETE, path=Path("a-01.mcap"))
-    make_series(session_count=3).run(
-        StoppingRig(result), stop, listener, with_live_view=False, quick_looks=queue
-    )
+    unrequested = pytest.raises(RigStoppedError, match=r"was asked to end\.$")
+    with unrequested if signalled == "control" else contextlib.nullcontext():
+        make_series(session_count=3).run(
+            StoppingRig(result), stop, listener, with_live_view=False, quick_looks=queue
+        )
     names = [each if isinstance(each, str) else each[0] for each in listener.calls]
     assert names == ["on_start", "held", "let go", "on_result", "look", "watch"]
+
+
+def test_stop_signal_in_a_probing_move_is_no_failure(tmp_path, monkeypatch):
+    profile, stop, rig = load_shipped("antenna_can"), StopRequest(), Rig()
+    excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
+    rig.connected = False
+
+    def end_by_signal(*_, **__):
+        raise RigStoppedError
+
+    monkeypatch.setattr("rigd.runner._probing.verify_by_probing", end_by_signal)
+    series = Series(profile, excitation, tmp_path / "out")
+    with pytest.raises(RigStoppedError):
+        series.run(rig, stop, RecordingListener(), with_live_view=False)
+    monkeypatch.setattr(
+        "rigd.runner._probing.verify_by_probing", lambda *_, **__: stop.request() or end_by_signal()
+    )
+    series.run(rig, stop, RecordingListener(), with_live_view=False)
+    assert not rig.orders
 
 
 @pytest.mark.process
