@@ -121,6 +121,10 @@ _MIN_RATE_TO_BAND_RATIO: Final = 2.4
 """Minimum decimated sampling rate relative to the highest frequency: at lower rates the decimation
 filter becomes long."""
 
+_RATE_TO_BAND_RATIOS: Final = (_MIN_RATE_TO_BAND_RATIO, 5.0, 10.0)
+"""Minimum decimated sampling rates relative to the highest frequency: the filter has a half length
+of some 13, 2 or 0.8 periods of the highest frequency."""
+
 
 @dataclass(frozen=True, slots=True)
 class Decimation:
@@ -184,6 +188,27 @@ class Decimation:
         kernel = relative_cutoff * np.sinc(relative_cutoff * kernel_ticks)
         kernel *= np.kaiser(kernel_ticks.size, 0.1102 * (_STOP_BAND_ATTENUATION_DB - 8.7))
         return cls(downsampling_factor, kernel / kernel.sum(), half_length_samples, new_rate_hz)
+
+    @classmethod
+    def with_half_length(
+        cls, rate_hz: float, highest_hz: float, max_half_length_s: float
+    ) -> Decimation:
+        """Return the decimation to the lowest rate with a filter that is short enough.
+
+        If no filter is short enough, return the decimation to the lowest rate.
+
+        Parameters
+        ----------
+        rate_hz, highest_hz : float
+            As for `to_band`.
+        max_half_length_s : float
+            Largest half length of the filter in seconds.
+        """
+        for rate_to_band_ratio in _RATE_TO_BAND_RATIOS:
+            decimation = cls.to_band(rate_hz, highest_hz, rate_to_band_ratio)
+            if decimation.half_length_samples <= max_half_length_s * decimation.rate_hz:
+                return decimation
+        return cls.to_band(rate_hz, highest_hz)
 
     def apply(self, signal_values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Low-pass filter a signal and downsample it.

@@ -114,6 +114,9 @@ _MIN_GROUPS: Final = 64
 """Smallest number of such averages, if there are as many frequencies: in a short record, an average
 over more of them would be that of a whole resonance."""
 
+_MIN_COMPARED_MOTION_FRACTION: Final = 0.5
+"""Smallest part of the motor's squared speed that lies within the compared samples."""
+
 _MIN_PHASE_COSINE: Final = 0.7
 """Minimum magnitude of the median cosine of the phase between measured and expected response at
 which the sign of the ratio of torque to angle is certain."""
@@ -143,7 +146,19 @@ searches for a stiffness so far from that of the file."""
 
 
 def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
-    """Yield a finding if the ratio of torque to motor angle has a wrong sign or a wrong unit."""
+    """Yield a finding if the ratio of torque to motor angle has a wrong sign or a wrong unit.
+
+    There is none if most of the motion, such as a step, is before the first compared sample: the
+    torque then is that of a beam that is still ringing.
+    """
+    first_sample, end_sample = (
+        comparison.retained_samples.start,
+        comparison.retained_samples.stop,
+    )
+    squared_steps = np.diff(comparison.angle_rad[:end_sample]) ** 2
+    compared_fraction = squared_steps[first_sample:].sum() / squared_steps.sum()
+    if compared_fraction < _MIN_COMPARED_MOTION_FRACTION:
+        return
     angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained_samples])
     torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained_samples])
     angle_power = np.abs(angle_spectrum) ** 2

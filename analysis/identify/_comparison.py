@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from analysis.identify.noise import Hum, NoiseSpectrum
     from rigd.beam import Plant, Pole
 
+_MAX_FILTER_TO_REST_RATIO: Final = 0.5
+"""Largest half length of the decimation filter relative to the rest before a sudden motion."""
+
 _MIN_FREQUENCY_BINS: Final = 50
 """Minimum number of frequency bins in the compared band."""
 
@@ -152,7 +155,16 @@ class Comparison:
                 f"({band_limit_hz:g} Hz); choose another --band."
             )
         measurement.check_channels(highest_hz)
-        decimation = Decimation.to_band(measurement.rate_hz, highest_hz)
+        # The rest before a step shows whether the beam was ringing: the filter may take a part of
+        # it only.
+        rest_s = measurement.sudden_motion_s()
+        decimation = (
+            Decimation.to_band(measurement.rate_hz, highest_hz)
+            if rest_s is None
+            else Decimation.with_half_length(
+                measurement.rate_hz, highest_hz, _MAX_FILTER_TO_REST_RATIO * rest_s
+            )
+        )
         angle_rad = decimation.apply(measurement.angle_from_rest_rad(highest_hz))
         usable_samples = decimation.samples_inside_record(measurement.angle_rad.size)
         sample_count = usable_samples.stop - usable_samples.start

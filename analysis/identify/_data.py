@@ -41,6 +41,10 @@ amplitude and phase of every mode."""
 _FILTER_SETTLING_TIME_CONSTANTS: Final = 5.0
 """Settling time of a filter of the torque channel, in multiples of its time constant."""
 
+_MOTION_FRACTIONS: Final = (0.02, 0.2)
+"""Fractions of the largest distance from the first angle, between which a motion is sudden or slow.
+"""
+
 MAX_TORQUE_GAP_S: Final = 1.0
 """Longest tolerated gap of the torque: a longer gap may hide a whole resonance."""
 
@@ -335,6 +339,19 @@ class Measurement:
         for first_tick, end_tick in tick_ranges:
             is_torque_known[first_tick:end_tick] = False
         return replace(self, torque_known=is_torque_known)
+
+    def sudden_motion_s(self) -> float | None:
+        """Return the time in seconds from the first tick at which the motor suddenly moves.
+
+        Return None if it moves from the first tick on, or slowly at first, as in a sweep.
+        """
+        known_ticks = np.flatnonzero(self.angle_known)
+        distance_rad = np.abs(self.angle_rad[known_ticks] - self.angle_rad[known_ticks[0]])
+        first_tick, later_tick = (
+            int(known_ticks[np.argmax(distance_rad > fraction * distance_rad.max())])
+            for fraction in _MOTION_FRACTIONS
+        )
+        return first_tick / self.rate_hz if later_tick < 2 * first_tick else None
 
     @property
     def nominal_plant(self) -> Plant:

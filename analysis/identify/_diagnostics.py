@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from analysis.identify._candidates import CandidateSet
+    from analysis.identify._data import Measurement
     from analysis.identify._estimates import ModeEstimate
+    from analysis.identify._modal_fit import ModalFit
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._settings import Setting
     from analysis.identify._step_in_time import StiffnessStep
@@ -32,14 +34,15 @@ if TYPE_CHECKING:
 
 def findings(
     candidate_set: CandidateSet,
+    modal_fit: ModalFit | None,
     forces: tuple[NonlinearForce, ...],
     harmonics: tuple[Harmonic, ...],
 ) -> tuple[Finding, ...]:
     """Return the effects found in a record that a linear damped beam does not explain.
 
-    If a sign or unit of the record is wrong, only findings that need no model are returned. All
-    `forces` are significant, and `harmonics` are the residual at multiples of the sweep's
-    frequency.
+    If a sign or unit of the record is wrong, only findings that need no model are returned.
+    `modal_fit` is None if no mode is visible. All `forces` are significant, and `harmonics` are the
+    residual at multiples of the sweep's frequency.
     """
     measurement = candidate_set.comparison.measurement
     model_independent_findings = (
@@ -49,6 +52,8 @@ def findings(
     )
     if candidate_set.misread_findings:
         return model_independent_findings
+    if modal_fit is not None and not modal_fit.determines_response:
+        return (*model_independent_findings, _hidden_response_finding(measurement, modal_fit))
     all_findings = (
         *model_independent_findings,
         *_hum_findings(candidate_set),
@@ -57,6 +62,26 @@ def findings(
         *_harmonic_findings(harmonics),
     )
     return (*all_findings, *search_limit_findings(candidate_set))
+
+
+def _hidden_response_finding(measurement: Measurement, modal_fit: ModalFit) -> Finding:
+    """Return the finding that the response to the motor is not determined."""
+    lowest_hz = min(pole.imag for pole in modal_fit.poles_rad_s.values()) / (2 * math.pi)
+    period_s = math.ceil(10 / lowest_hz) / 10  # of the first mode, in tenths of a second
+    return Finding(
+        kind="hidden response",
+        sentence=(
+            "The response to the motor cannot be told from a ringing of the beam when the record "
+            "began, because the motor moves too early in the record, or too little. The record "
+            "does not determine inertias, stiffness, delay and orders, and damping ratios only "
+            "roughly."
+        ),
+        remedy=(
+            f"Begin the part (--from) at least {period_s:g} s before the motor moves."
+            if measurement.is_later_part
+            else f"Let the beam rest for at least {period_s:g} s before the motor moves (--rest)."
+        ),
+    )
 
 
 # Settings at the limit of the search range, or different from the file
@@ -242,8 +267,10 @@ def _equivalent_causes(candidate_set: CandidateSet, setting_name: Setting) -> st
 
 def _initial_ringing_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
     """Yield a finding if the modal model shows that the beam was ringing when the record began."""
-    initial_ringing = None if headline.modal is None else headline.modal.ringing
-    if initial_ringing is None or not initial_ringing.degrees_of_freedom:
+    if headline.modal is None or not headline.modal.determines_response:
+        return
+    initial_ringing = headline.modal.ringing
+    if not initial_ringing.degrees_of_freedom:
         return
     largest_ringing_nm = max(initial_ringing.amplitude_nm)
     # A hum begins and ends with the record, and so resembles a decay.

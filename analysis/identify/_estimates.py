@@ -58,11 +58,15 @@ class Ringing:
         Chi-square of all amplitudes together, with any hum fitted as well.
     degrees_of_freedom : int
         Number of fitted amplitudes.
+    residue_std_growth : float
+        Factor by which the free decay makes the residue of a mode less certain; the largest of all
+        modes. 1 if it was not computed.
     """
 
     amplitude_nm: tuple[float, ...]
     chi_square: float
     degrees_of_freedom: int
+    residue_std_growth: float = 1.0
 
     @property
     def is_significant(self) -> bool:

@@ -15,6 +15,7 @@ FindingKind = Literal[
     "delay",
     "tool inertia",
     "ringing start",
+    "hidden response",
     "beam data",
     "clock rate difference",
     "rival explanations",
@@ -78,6 +79,7 @@ MODEL_INDEPENDENT_KINDS: Final[frozenset[FindingKind]] = frozenset(
         "stop",
         "knock",
         "implausible",
+        "hidden response",
         "unexplained",
     }
 )

@@ -85,6 +85,17 @@ _MIN_VISIBLE_DEVIANCE_REDUCTION: Final = 400.0
 known to a tenth."""
 
 
+_MAX_RESIDUE_STD_GROWTH: Final = 10.0
+"""Growth of the standard deviations of the residues by the free decay from which the response to
+the motor is not determined. Before a step it is 1 to 4 after a rest of 0.3 s or more, and 35 to 170
+after 0.1 s or less."""
+
+_MAX_RELATIVE_RESIDUE_STD: Final = 0.3
+"""Standard deviation of the logarithm of a visible mode's residue from which the response to the
+motor is not determined, as in the decay after a step. Intervals assume that the fit is linear in
+the unknowns, and are wrong for more uncertain residues."""
+
+
 @dataclass(frozen=True, slots=True)
 class ModalFit(ModalEstimate):
     """Modal model (poles and residues of each mode) fitted to one record.
@@ -232,6 +243,20 @@ class ModalFit(ModalEstimate):
                 for mode_number, deviance_reduction in modes_with_cost_increase
                 if mode_number and deviance_reduction > _MIN_VISIBLE_DEVIANCE_REDUCTION
             )
+        )
+
+    @property
+    def determines_response(self) -> bool:
+        """Return whether the response to the motor is distinct from a ringing of the beam.
+
+        Otherwise residues, and all that follows from them, are not determined.
+        """
+        residue_indices = self.constant_indices(self.visible_mode_numbers)[
+            MODE_CONSTANT_NAMES.index("ln_residue") :: len(MODE_CONSTANT_NAMES)
+        ]
+        residue_variances = np.diag(self.covariance)[residue_indices]
+        return self.ringing.residue_std_growth <= _MAX_RESIDUE_STD_GROWTH and bool(
+            np.all(residue_variances <= _MAX_RELATIVE_RESIDUE_STD**2)
         )
 
     def plant_with_modal_frequencies(self, plant: Plant) -> Plant:

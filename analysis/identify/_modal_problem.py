@@ -383,6 +383,7 @@ class ModalProblem:
         """Return amplitudes and chi-square of the free decay at the beginning of the record.
 
         The decay of each mode has two amplitudes, which are free linear parameters of the fit.
+        `covariance` is that of frequencies, damping and linear parameters together.
         """
         mode_count = len(self._numbers)
         decay_start = 2 * mode_count + BACKGROUND_COEFFICIENTS
@@ -390,6 +391,16 @@ class ModalProblem:
         decay_rows = slice(
             2 * mode_count + decay_start, 2 * mode_count + decay_start + 2 * mode_count
         )
+        # Variances of the modes' numerators, and those that they would have with known decays.
+        numerator_rows = slice(2 * mode_count, 4 * mode_count)
+        numerator_variances = np.diag(covariance)[numerator_rows]
+        covariance_with_decays = covariance[numerator_rows, decay_rows]
+        variances_by_decays = np.einsum(
+            "ij,ji->i",
+            covariance_with_decays,
+            np.linalg.solve(covariance[decay_rows, decay_rows], covariance_with_decays.T),
+        )
+        known_fractions = 1 - variances_by_decays / numerator_variances
         return Ringing(
             amplitude_nm=tuple(np.hypot(decay_amplitudes[::2], decay_amplitudes[1::2]).tolist()),
             chi_square=float(
@@ -397,6 +408,9 @@ class ModalProblem:
                 @ np.linalg.solve(covariance[decay_rows, decay_rows], decay_amplitudes)
             ),
             degrees_of_freedom=decay_amplitudes.size,
+            residue_std_growth=float(
+                np.max(np.maximum(known_fractions, np.finfo(float).eps) ** -0.5, initial=1.0)
+            ),
         )
 
     def constants_with_covariance(

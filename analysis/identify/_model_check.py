@@ -11,7 +11,11 @@ from analysis.identify._impacts import impact_findings
 from analysis.identify._record_model import test_residual
 from analysis.identify._time_varying import is_single_change_established
 from analysis.identify._visible_modes import visible_modes
-from analysis.identify.headline import CONTRADICTED_FILE_REASON, UNEXPLAINED_REASON
+from analysis.identify.headline import (
+    CONTRADICTED_FILE_REASON,
+    HIDDEN_RESPONSE_REASON,
+    UNEXPLAINED_REASON,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -73,7 +77,9 @@ class ModelCheck:
     ) -> ModelCheck:
         """Check a model, including its nonlinear forces and changes along the record."""
         residual_tests = test_residual(candidate_set, modal_fit, band_hz)
-        model_findings = findings(candidate_set, nonlinear_forces, residual_tests.harmonics)
+        model_findings = findings(
+            candidate_set, modal_fit, nonlinear_forces, residual_tests.harmonics
+        )
         return cls(candidate_set, modal_fit, residual_tests, model_findings, temporal_changes)
 
     @property
@@ -101,9 +107,19 @@ class ModelCheck:
         return _CLIPPED_TORQUE_REASON if "clipping" in self.finding_kinds else None
 
     @property
+    def hidden_response_reason(self) -> str | None:
+        """Return the reason to doubt all numbers if the response is not determined, else None."""
+        return HIDDEN_RESPONSE_REASON if "hidden response" in self.finding_kinds else None
+
+    @property
     def doubt_reason(self) -> str | None:
         """Return the reason to doubt every number; None if there is none."""
-        return self.model_rejection_reason or self.clipped_torque_reason or self._change_reason
+        return (
+            self.model_rejection_reason
+            or self.clipped_torque_reason
+            or self.hidden_response_reason
+            or self._change_reason
+        )
 
     @property
     def mode_doubt_reason(self) -> str | None:
@@ -114,7 +130,9 @@ class ModelCheck:
         """
         if self.temporal_changes and self.temporal_changes[0].is_certain:
             return self.doubt_reason
-        return self.model_rejection_reason or self.clipped_torque_reason
+        return (
+            self.model_rejection_reason or self.clipped_torque_reason or self.hidden_response_reason
+        )
 
     @property
     def _change_reason(self) -> str | None:

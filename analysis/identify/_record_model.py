@@ -151,6 +151,11 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     linear_fit = fit_modal_model(linear_candidates)
     if linear_fit is None:
         return RecordModel(linear_candidates, None, linear_candidates, None, explains_record=False)
+    if not linear_fit.determines_response:  # nor would it determine an effect
+        return RecordModel(
+            linear_candidates, linear_fit, linear_candidates, linear_fit,
+            explains_record=_explains_record(linear_candidates, linear_fit, band_hz),
+        )  # fmt: skip
     is_single_sweep = linear_candidates.comparison.measurement.is_single_sweep
     drag_spectrum = _small_drag_spectra(linear_candidates, linear_fit)
     likeliest_effect = likeliest_small_effect(

@@ -35,7 +35,7 @@ from analysis.identify._step_in_time import best_stiffness_step
 from analysis.identify._time_varying import (
     temporal_change_findings,
 )
-from analysis.identify.beam_uniformity import uniform_beam_test
+from analysis.identify.beam_uniformity import UniformBeamTest, uniform_beam_test
 from analysis.identify.headline import (
     TILTED_AXIS_REASON,
     Headline,
@@ -73,7 +73,6 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._result import RecordFit
     from analysis.identify._settings import Setting
-    from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.identify.profile_likelihood import OrderName
 
 
@@ -383,6 +382,8 @@ def _uniform_beam_test(
     """Test whether a uniform beam predicts the measured modes; None if there is no modal model."""
     if modal_fit is None:
         return None
+    if not modal_fit.determines_response:
+        return UniformBeamTest.not_made(modal_fit)
     return uniform_beam_test(modal_fit, measurement.nominal_plant, measurement.axis_tilt_deg)
 
 

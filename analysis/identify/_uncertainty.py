@@ -170,15 +170,17 @@ def interval(parameter_name: str, parameter_value: float, std: float) -> tuple[f
     return parameter_value - half_width, parameter_value + half_width
 
 
-def interval_from_zero(estimated_value: float, std: float) -> tuple[float, float]:
+def interval_from_zero(
+    estimated_value: float, std: float, half_width: float = NORMAL_95
+) -> tuple[float, float]:
     """Return the 95 % interval of a quantity that cannot be negative.
 
     It is the non-negative part of the symmetric interval. So it begins at 0 if the estimate is
     within 1.96 standard deviations of 0. It covers a true value of 0 in 97.5 % of all records,
-    other true values in 95 to 97.5 %. `std` is the standard deviation without the bound at 0.
+    other true values in 95 to 97.5 %. `std` is the standard deviation without the bound at 0, and
+    `half_width` the half width of the symmetric interval in standard deviations.
     """
-    half_width = NORMAL_95 * std
-    return max(estimated_value - half_width, 0.0), estimated_value + half_width
+    return max(estimated_value - half_width * std, 0.0), estimated_value + half_width * std
 
 
 # Loss factor at its pivot frequency

@@ -33,7 +33,8 @@ class UniformBeamTest:
     Attributes
     ----------
     status : str
-        "passed", "refused", or "not tested" if there are no degrees of freedom.
+        "passed", "refused", or "not tested" if there are no degrees of freedom or if the residues
+        are not determined.
     chi_square : float
         Weighted sum of squared differences between measured and predicted constants.
     degrees_of_freedom : int
@@ -61,6 +62,24 @@ class UniformBeamTest:
     constant_stds: NDArray[np.float64]
     problem: UniformBeamProblem | None
     best_fit_unknowns: NDArray[np.float64]
+
+    @classmethod
+    def not_made(cls, modal_estimate: ModalEstimate) -> UniformBeamTest:
+        """Return the result of a test that is not made, because the record cannot decide it."""
+        mode_numbers = modal_estimate.visible_mode_numbers
+        constant_indices = modal_estimate.constant_indices(mode_numbers)
+        return cls(
+            "not tested",
+            math.nan,
+            0,
+            None,
+            mode_numbers,
+            modal_estimate.mode_constants[constant_indices],
+            np.full(constant_indices.size, np.nan),
+            np.sqrt(np.diag(modal_estimate.covariance)[constant_indices]),
+            None,
+            np.full(len(PARAMETERS), np.nan),
+        )
 
     @property
     def summary(self) -> BeamUniformity:
@@ -116,18 +135,7 @@ def uniform_beam_test(
     )
     degrees_of_freedom = len(constant_indices) - len(PARAMETERS)
     if degrees_of_freedom <= 0:
-        return UniformBeamTest(
-            "not tested",
-            math.nan,
-            0,
-            None,
-            mode_numbers,
-            measured_constants,
-            np.full(measured_constants.size, np.nan),
-            std,
-            None,
-            np.full(len(PARAMETERS), np.nan),
-        )
+        return UniformBeamTest.not_made(modal_estimate)
     problem = UniformBeamProblem(modal_estimate, mode_numbers, nominal_plant, tilt_deg=tilt_deg)
     best_minimum = problem.minima()[0]
     degrees_of_freedom += problem.count_idle_unknowns(best_minimum)

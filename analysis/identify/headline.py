@@ -14,6 +14,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
+from analysis.identify._uncertainty import interval_from_zero
 from analysis.identify.verdict import (
     EXCLUSION_DEVIANCES,
     SECOND_DAMPING_REASON,
@@ -44,6 +45,11 @@ UNEXPLAINED_REASON: Final = "part of the record is unexplained"
 
 TILTED_AXIS_REASON: Final = "the axis is tilted, and fits to the whole record assume a plumb axis"
 """Reason against the estimates on an exactly uniform beam if the axis is tilted."""
+
+HIDDEN_RESPONSE_REASON: Final = (
+    "the response to the motor cannot be told from a ringing of the beam when the record began"
+)
+"""Reason against all numbers if the motor moves too early in the record, or too little."""
 
 CONTRADICTED_FILE_REASON: Final = "the record contradicts its file"
 """Reason against all numbers if a sign or unit of the file is wrong."""
@@ -594,8 +600,10 @@ def _reported_mode(
         invalid_reason = "computed from the model: the record does not show this mode"
     return ReportedMode(
         mode_estimate.number,
-        symmetric_value(mode_estimate.frequency_hz, mode_estimate.frequency_std_hz, invalid_reason),
-        symmetric_value(
+        non_negative_value(
+            mode_estimate.frequency_hz, mode_estimate.frequency_std_hz, invalid_reason
+        ),
+        non_negative_value(
             mode_estimate.damping_ratio, mode_estimate.damping_ratio_std, invalid_reason
         ),
         is_visible_mode,
@@ -603,10 +611,10 @@ def _reported_mode(
     )
 
 
-def symmetric_value(
+def non_negative_value(
     estimated_value: float, std: float, invalid_reason: str | None, half_width: float = NORMAL_95
 ) -> Estimate:
-    """Return a reported value with a symmetric 95 % interval.
+    """Return a reported value that cannot be negative, with its 95 % interval.
 
     Parameters
     ----------
@@ -617,10 +625,6 @@ def symmetric_value(
     half_width : float
         Half width of the interval, in standard deviations.
     """
-    interval_half_width = half_width * std
     return Estimate(
-        estimated_value,
-        std,
-        (estimated_value - interval_half_width, estimated_value + interval_half_width),
-        invalid_reason,
+        estimated_value, std, interval_from_zero(estimated_value, std, half_width), invalid_reason
     )

@@ -15,8 +15,8 @@ from analysis.identify._uncertainty import pivot_loss_factor
 from analysis.identify.headline import (
     DAMPING_PARAMETER_NAMES,
     Estimates,
+    non_negative_value,
     reported_loss_factor,
-    symmetric_value,
 )
 from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION
 from analysis.identify.uniform_beam import PARAMETERS
@@ -238,15 +238,15 @@ def _reported_modes(
         inertia_kg_m2, relative_std = modal.effective_inertia(mode_number)
         mode_estimate = ReportedMode(
             mode_number,
-            symmetric_value(
+            non_negative_value(
                 modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt_reason, half_width
             ),
-            symmetric_value(
+            non_negative_value(
                 modal_mode.damping_ratio, modal_mode.damping_ratio_std, doubt_reason, half_width
             ),
             shown=True,
             source="modal",
-            participation=symmetric_value(
+            participation=non_negative_value(
                 inertia_kg_m2, inertia_kg_m2 * relative_std, doubt_reason, half_width
             ),
         )

@@ -60,7 +60,7 @@ def headline_sentences(
     else:
         sentences = [
             *uniformity(headline.uniform_beam),
-            *_damping_sentences(headline, order_verdicts),
+            *_damping_sentences(headline, order_verdicts, without_rival=without_rival),
         ]
     if headline.tolerant is None:
         sentences += [order_sentence(order_verdict) for order_verdict in order_verdicts]
@@ -102,11 +102,15 @@ def uniformity(beam_test: UniformBeamTest | None) -> list[str]:
 
 
 def _damping_sentences(
-    headline: Headline, order_verdicts: tuple[OrderVerdict, OrderVerdict]
+    headline: Headline, order_verdicts: tuple[OrderVerdict, OrderVerdict], *, without_rival: bool
 ) -> list[str]:
-    """Return the sentences on the dampings that a beam has, and on the excluded structures."""
+    """Return the sentences on the dampings that a beam has, and on the excluded structures.
+
+    `without_rival` is whether no other model explains the record as well: otherwise no structure is
+    excluded.
+    """
     if headline.tolerant is not None:
-        excluded_names = headline.structures_with_status("excluded")
+        excluded_names = headline.structures_with_status("excluded") if without_rival else ()
         return (
             [f"Excluded by the losses: {_list_structures(excluded_names)}."]
             if excluded_names
@@ -118,7 +122,7 @@ def _damping_sentences(
         damping_phrase = damping_phrase.replace("only", "alone is sufficient")
     sentences = [f"{damping_phrase}. Numbers are those of type {headline.name}, all orders free."]
     excluded_names = headline.structures_with_status("excluded")
-    if headline.is_explained and excluded_names:
+    if headline.is_explained and without_rival and excluded_names:
         sentences.append(f"Excluded: {_list_structures(excluded_names)}.")
     if headline.simpler is not None and headline.simpler.fixed:
         sentences.append(_conditional_sentence(headline.simpler))

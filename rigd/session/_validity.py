@@ -72,7 +72,10 @@ class BeamUniformity:
                 f"A uniform beam does not predict the modes ({self.chance}): orders that assume "
                 "one are not properties of the material."
             )
-        return "Whether a uniform beam predicts the modes was not tested: too few modes show."
+        return (
+            "Whether a uniform beam predicts the modes was not tested: too few modes are "
+            "determined."
+        )
 
     @property
     def short_text(self) -> str:

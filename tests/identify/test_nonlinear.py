@@ -59,7 +59,8 @@ def test_harmonics_of_a_force(link, plants, kind, multiples):
     )
     samples = np.zeros(comparison.sample_count // 2 + 1, dtype=complex)
     samples[comparison.band_bins] = column
-    late = np.fft.irfft(samples, comparison.sample_count)[-5000:]  # 40 s: 80 periods
+    last = round(40 * comparison.decimation.rate_hz)  # samples of 40 s: 80 periods
+    late = np.fft.irfft(samples, comparison.sample_count)[-last:]
     power = np.abs(np.fft.rfft(late * np.hanning(late.size))) ** 2
     at = {m: power[m * 80 - 2 : m * 80 + 3].sum() for m in (1, 2, 3)}
     made = {m for m, value in at.items() if value > 1e-4 * max(at.values())}

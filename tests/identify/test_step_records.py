@@ -2,10 +2,11 @@
 
 import pytest
 
-from analysis.identify import select
+from analysis.identify import fit_freest_alone, select
 from analysis.identify.profile_likelihood import LikelihoodProfile, profile_both_orders
 from analysis.identify.sentences import order_sentence
 from analysis.identify.verdict import order_verdict
+from rigd.beam import Plant
 
 pytestmark = pytest.mark.fit
 
@@ -27,6 +28,43 @@ def test_delay_is_reported_in_a_step(steps):
     (found,) = select(measured).verdict.findings
     assert found.kind == "delay"
     assert found.value == pytest.approx(2e-3, abs=3e-4)
+
+
+def test_step_after_a_short_rest_determines_the_stiffness(steps, true_parameters):
+    measured = steps("III", 0.05, rest_s=0.3, held_s=4.3).measured(noise_nm=2e-3, seed=3)
+    headline = select(measured).headline
+    assert headline.modal.visible_mode_numbers == (1, 2)
+    assert headline.uniform_beam.status == "passed"
+    stiffness = headline.parameters["bending_stiffness_n_m2"]
+    error = stiffness.value - true_parameters("III")["bending_stiffness_n_m2"]
+    assert abs(error) < 4 * stiffness.std
+    assert stiffness.std < 0.1 * stiffness.value
+    assert not any(finding.kind == "ringing start" for finding in select(measured).verdict.findings)
+
+
+@pytest.mark.parametrize("first_tick", [250, 1500])
+def test_step_without_a_rest_determines_nothing_but_the_decay(steps, link, plants, first_tick):
+    """A rest of 50 ms, or only the decay after the step."""
+    measured = steps("III", 0.05, rest_s=0.3, held_s=9.7).cut(first_tick).measured(
+        noise_nm=2e-3, seed=3
+    )  # fmt: skip
+    selection = select(measured)
+    (found,) = selection.verdict.findings
+    assert found.kind == "hidden response"
+    assert "at least 0.4 s before the motor moves" in found.remedy
+    headline = selection.headline
+    assert headline.uniform_beam.status == "not tested"
+    assert not any("uniform" in sentence for sentence in selection.verdict.sentences)
+    assert all(
+        number.flag is not None
+        for mode in headline.modes
+        for number in (mode.frequency_hz, mode.damping_ratio, mode.participation)
+        if number is not None
+    )
+    assert all(parameter.flag is not None for parameter in headline.parameters.values())
+    pole = Plant(link, plants["III"]).mode_poles(1)[0].at_rad_s
+    assert headline.modes[0].damping_ratio.value == pytest.approx(-pole.real / abs(pole), rel=0.1)
+    assert fit_freest_alone(measured)[1] == (found,)
 
 
 @pytest.mark.further  # the profile's parts are in test_profile_valleys.py

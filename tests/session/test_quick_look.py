@@ -89,7 +89,7 @@ def test_an_invalid_test_of_uniformity_is_unknown(tmp_path, stated):
         (BeamUniformity("refused", 0.0), "A uniform beam does not predict the modes (p < 1e-300): "
          "orders that assume one are not properties of the material.", "no (p < 1e-300)"),
         (BeamUniformity("not tested"), "Whether a uniform beam predicts the modes was not tested: "
-         "too few modes show.", "not tested"),
+         "too few modes are determined.", "not tested"),
     ],
 )  # fmt: skip
 def test_a_test_of_uniformity_is_stated_in_words(found, sentence, short):
