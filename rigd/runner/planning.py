@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, Plant
+from rigd.beam import Beam, Plant, undamped_frequencies_rad_s
 from rigd.beam.realisation import RealisationError
 from rigd.beam.tip import TipMotion, tip_motion
 from rigd.checks import OfflineCheckResult, run_offline_checks
@@ -48,6 +48,8 @@ _UNKNOWN_FORCE_WARNING = (
     "Without sensor.shear_projection in the profile the contact force is not known: force_limit_n "
     "(--force-limit) has no effect, and points are less precise."
 )
+_STEP_FRACTION = 0.2
+"""Fraction of the largest angle that the reference of a step reaches with its first change."""
 
 
 class RefusedError(UserError):
@@ -358,6 +360,8 @@ def predict_session(
         ]
     if excitation.limits_force and not any(profile.rig.sensor.shear_projection):
         warnings.append(_UNKNOWN_FORCE_WARNING)
+    if short_rest_warning := _short_rest_warning(profile, excitation):
+        warnings.append(short_rest_warning)
     return SessionPlan(
         prediction,
         warnings=tuple(warnings),
@@ -628,6 +632,26 @@ class _LimitedPeak:
             f"The predicted peak {self.name} of {self.value:.4g} {self.unit} exceeds "
             f"{self.limit:.4g} {self.unit} ({self.limit_key})"
         )
+
+
+def _short_rest_warning(profile: Profile, excitation: Excitation) -> str:
+    """Return a warning if the beam rests for less than a period before a step, else "".
+
+    Otherwise the decay after the step may be that of a beam that was ringing before.
+    """
+    distance_rad = np.abs(excitation.reference_rad - excitation.reference_rad[0])
+    first_tick = int(np.argmax(distance_rad > 0))
+    is_step = distance_rad[first_tick] > _STEP_FRACTION * distance_rad.max()
+    rest_s = first_tick / profile.rig.rate_hz
+    period_s = 2 * math.pi / undamped_frequencies_rad_s(profile.rig.beam, 1)[0]
+    if not (is_step and excitation.shows_modes) or rest_s >= period_s:
+        return ""
+    least_rest_s = math.ceil(10 * period_s) / 10
+    return (
+        f"The motor steps {rest_s:g} s after the record begins. analyze may not distinguish its "
+        "effect from a vibration that was there before: rest for at least a period of mode 1 "
+        f"(--rest {least_rest_s:g})."
+    )
 
 
 def _limited_peaks(

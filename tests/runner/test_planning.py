@@ -120,6 +120,16 @@ def test_warning_if_the_contact_force_is_unknown(profile, projection):
 
 
 @pytest.mark.parametrize(
+    ("make", "rest_s", "warned"), [(step, 0.1, True), (step, 0.4, False), (chirp, 0.1, False)]
+)
+def test_warning_of_a_short_rest_before_a_step(profile, make, rest_s, warned):
+    excitation = make(rate_hz=1000.0, duration_s=4.0, rest_s=rest_s, ring_down_s=0.3)
+    warnings = plan_session(profile, excitation).warnings
+    assert any("--rest 0.4" in each for each in warnings) == warned
+    assert len(warnings) == warned
+
+
+@pytest.mark.parametrize(
     ("start_hz", "expected"),
     [(60.0, "sweeps down from 60 to 50 Hz"), (0.05, "sweeps from 0.05 to 50 Hz")],
 )
