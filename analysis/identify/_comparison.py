@@ -14,13 +14,14 @@ import numpy as np
 from analysis.decimation import Decimation, fast_fft_length_below
 from analysis.identify._data import MeasurementError
 from analysis.identify._drag_expansion import DragExpansion
+from analysis.identify._encoder import encoder_step_rad
 from analysis.identify._instrument import reference_coherent_angle
 from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragResponse
 from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, count_decay_spectra
 from analysis.models import MAX_FREQUENCY_TO_RATE_RATIO
 from analysis.optimizer import RecentValues
-from rigd.beam import undamped_frequencies_rad_s
+from rigd.beam import Plant, ResponseGrid, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from analysis.identify._modal_model import ModalEstimate, ModalModel
     from analysis.identify.drag_torque import DragLaw
     from analysis.identify.noise import Hum, NoiseSpectrum
-    from rigd.beam import Plant, Pole
+    from rigd.beam import Pole
 
 _MAX_FILTER_TO_REST_RATIO: Final = 0.5
 """Largest half length of the decimation filter relative to the rest before a sudden motion."""
@@ -78,6 +79,8 @@ class Comparison:
         Frequencies of these bins.
     visible_mode_count : int
         Number of modes of the nominal beam in the band; their free decay is projected out.
+    encoder_step_rad : float
+        Step of the encoder; 0 if the angle has no steps.
     decay_spectra : DecaySpectra
         Spectra of the free decay at the beginning.
     later_decay_spectra : tuple of LaterDecaySpectra
@@ -114,6 +117,7 @@ class Comparison:
     band_bins: slice
     frequency_hz: NDArray[np.float64]
     visible_mode_count: int
+    encoder_step_rad: float
     decay_spectra: DecaySpectra
     later_decay_spectra: tuple[LaterDecaySpectra, ...] = ()
     removed_torque_nm: NDArray[np.float64] | float = 0.0
@@ -210,6 +214,7 @@ class Comparison:
             visible_mode_count=int(
                 np.sum(undamped_frequencies_rad_s(nominal_beam, 50) < 2 * np.pi * highest_hz)
             ),
+            encoder_step_rad=encoder_step_rad(measurement.angle_rad),
             decay_spectra=DecaySpectra(sample_count, decimation.rate_hz, omega_rad_s),
         )
         gap_ends_s = [
@@ -315,6 +320,28 @@ class Comparison:
     def band_spectrum(self, time_series: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Transform time series of all samples to spectra in the band, as `spectrum` does."""
         return self.spectrum(time_series[..., self.retained_samples])
+
+    def encoder_noise_power(self, plant: Plant | ModalModel) -> NDArray[np.float64]:
+        """Return the power of the torque that the rounding of the angle adds to the residual, (K,).
+
+        At a sharp resonance it exceeds the noise of the torque, in a band narrower than the blocks
+        in which that is estimated. The rounding of a moving encoder is white noise with a variance
+        of a twelfth of the squared step (B. Widrow, IRE Trans. Circuit Theory 3 (1956) 266-276).
+
+        Parameters
+        ----------
+        plant : Plant or ModalModel
+            Current estimate.
+        """
+        if not self.encoder_step_rad:
+            return np.zeros(self.frequency_hz.size)
+        s = 2j * np.pi * self.frequency_hz
+        response = (
+            ResponseGrid(s).evaluate(plant)[0] if isinstance(plant, Plant) else plant.response(s)
+        )
+        angle_variance_rad2 = self.encoder_step_rad**2 / 12
+        decimated_fraction = self.decimation.rate_hz / self.measurement.rate_hz
+        return np.abs(response) ** 2 * angle_variance_rad2 * self.sample_count * decimated_fraction
 
     def to_time_series(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Transform a spectrum in the band, shape (K,), to the time series of retained samples.

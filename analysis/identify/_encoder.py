@@ -1,4 +1,4 @@
-"""Encoder readings of a motor at rest.
+"""Steps of the encoder: their size, and readings of a motor at rest.
 
 While the beam rings, a resting motor moves by much less than a count. But if it rests near the edge
 between two counts, its encoder alternates between them at the frequency of the mode. A fit takes
@@ -23,6 +23,46 @@ _MIN_ALTERNATING_CHANGES: Final = 4
 _MAX_SINGLE_COUNT_RATIO: Final = 1.5
 """Largest change of the reading that is a single count, relative to the smallest change of the
 record."""
+
+
+_STEP_QUANTILES: Final = (0.01, 0.0)
+"""Quantiles of the changes of the angle that may be a single step of the encoder. Smaller changes
+than that of the first quantile may be halves of a step, from a correction of the readings."""
+
+_MAX_STEP_DEVIATION: Final = 0.05
+"""Largest deviation of a change from a multiple of the step, relative to the step."""
+
+_MIN_FRACTION_OF_MULTIPLES: Final = 0.9
+"""Smallest fraction of the changes that are multiples of the step of an encoder."""
+
+
+def encoder_step_rad(angle_rad: NDArray[np.float64]) -> float:
+    """Return the step of the encoder that measured an angle, in rad; 0 if the angle has no steps.
+
+    Parameters
+    ----------
+    angle_rad : ndarray, shape (n,)
+        Measured angle; NaN where it is unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.identify._encoder import encoder_step_rad
+    >>> angle_rad = np.sin(np.arange(1000) / 100)
+    >>> encoder_step_rad(angle_rad), round(encoder_step_rad(0.01 * np.round(100 * angle_rad)), 6)
+    (0.0, 0.01)
+    """
+    changes_rad = np.abs(np.diff(angle_rad))
+    changes_rad = changes_rad[changes_rad > 0]
+    if changes_rad.size == 0:
+        return 0.0
+    for quantile in _STEP_QUANTILES:
+        step_rad = float(np.quantile(changes_rad, quantile, method="inverted_cdf"))
+        step_counts = changes_rad / step_rad
+        is_multiple = np.abs(step_counts - np.round(step_counts)) < _MAX_STEP_DEVIATION
+        if np.mean(is_multiple) > _MIN_FRACTION_OF_MULTIPLES:
+            return step_rad
+    return 0.0
 
 
 def angle_without_alternating_counts(

@@ -419,6 +419,7 @@ class _ModalSearch:
                 ~search.is_near_mode(within_resonance=True),
             )
             noise_power /= comparison.measurement.known_torque_fraction
+            noise_power += comparison.encoder_noise_power(modal_model)
             is_compared = search.noise.is_compared
             mean_log_change = np.abs(np.log(noise_power / search.noise.power)[is_compared]).mean()
             search = replace(

@@ -263,8 +263,11 @@ class Refit:
     def residual_noise(self) -> NoiseSpectrum:
         """Return the noise of the residual at this minimum. Lines stay excluded."""
         unwhitened_residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
-        known_fraction = self.objective.comparison.measurement.known_torque_fraction
-        return replace(self.noise, power=smooth_power(unwhitened_residual) / known_fraction)
+        comparison = self.objective.comparison
+        noise_power = smooth_power(unwhitened_residual)
+        noise_power /= comparison.measurement.known_torque_fraction
+        noise_power += comparison.encoder_noise_power(self.objective.unknowns.plant(self.x))
+        return replace(self.noise, power=noise_power)
 
 
 def part_outside_spectra(

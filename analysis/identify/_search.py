@@ -410,7 +410,7 @@ class Descent:
                     np.abs(frequency_hz - abs(mode_pole.at_rad_s.imag) / (2 * np.pi))
                     < mode_width_hz
                 )
-        return estimate_noise(
+        noise = estimate_noise(
             objective.project(linearisation, 1.0).residual,
             comparison.frequency_hz,
             comparison.sample_count,
@@ -418,6 +418,7 @@ class Descent:
             is_near_mode,
             driven_spectra,
         )
+        return replace(noise, power=noise.power + comparison.encoder_noise_power(self.plant))
 
 
 @dataclass(frozen=True, slots=True)

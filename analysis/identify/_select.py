@@ -339,7 +339,7 @@ def _select_with_known_impacts(
     verdict_sentences, experiment_texts = [], []
     if not model_check.contradicts_file:
         verdict_sentences = headline_sentences(
-            reported_headline, order_verdicts, without_rival=model_check.doubt_reason is None
+            reported_headline, order_verdicts, doubt_reason=model_check.doubt_reason
         )
         experiment_texts = experiments(
             candidate_set, order_verdicts, visible_numbers, all_findings, close_rival_candidates

@@ -51,6 +51,11 @@ HIDDEN_RESPONSE_REASON: Final = (
 )
 """Reason against all numbers if the motor moves too early in the record, or too little."""
 
+COARSE_ENCODER_REASON: Final = (
+    "at a sharp resonance, the steps of the encoder exceed the noise of the torque"
+)
+"""Reason against all numbers if the rounding of the angle is the largest noise at a mode."""
+
 CONTRADICTED_FILE_REASON: Final = "the record contradicts its file"
 """Reason against all numbers if a sign or unit of the file is wrong."""
 

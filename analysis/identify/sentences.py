@@ -42,7 +42,10 @@ LOSS_NAMES: Final[Mapping[OrderName, str]] = {
 
 
 def headline_sentences(
-    headline: Headline, order_verdicts: tuple[OrderVerdict, OrderVerdict], *, without_rival: bool
+    headline: Headline,
+    order_verdicts: tuple[OrderVerdict, OrderVerdict],
+    *,
+    doubt_reason: str | None,
 ) -> list[str]:
     """Return the sentences on modes, damping and conditions of the reported numbers.
 
@@ -52,15 +55,15 @@ def headline_sentences(
         Headline of the record.
     order_verdicts : tuple of OrderVerdict
         Verdicts on alpha and lambda.
-    without_rival : bool
-        Whether no other model explains the record as well.
+    doubt_reason : str or None
+        Reason to doubt every number. With one, no structure is excluded.
     """
     if len(headline.visible_modes) < _MIN_MODES_TO_SEPARATE_DAMPINGS:
         sentences = [f"{ONE_MODE_REASON.capitalize()}, nor does it determine their orders."]
     else:
         sentences = [
             *uniformity(headline.uniform_beam),
-            *_damping_sentences(headline, order_verdicts, without_rival=without_rival),
+            *_damping_sentences(headline, order_verdicts, doubt_reason=doubt_reason),
         ]
     if headline.tolerant is None:
         sentences += [order_sentence(order_verdict) for order_verdict in order_verdicts]
@@ -72,8 +75,8 @@ def headline_sentences(
     if headline.is_explained:
         sentences.append(
             "The residual is white: this model suffices for this record."
-            if without_rival
-            else "The residual is white, but another model fits the record equally well."
+            if doubt_reason is None
+            else f"The residual is white, but {doubt_reason}."
         )
     return sentences
 
@@ -102,15 +105,17 @@ def uniformity(beam_test: UniformBeamTest | None) -> list[str]:
 
 
 def _damping_sentences(
-    headline: Headline, order_verdicts: tuple[OrderVerdict, OrderVerdict], *, without_rival: bool
+    headline: Headline,
+    order_verdicts: tuple[OrderVerdict, OrderVerdict],
+    *,
+    doubt_reason: str | None,
 ) -> list[str]:
     """Return the sentences on the dampings that a beam has, and on the excluded structures.
 
-    `without_rival` is whether no other model explains the record as well: otherwise no structure is
-    excluded.
+    With a `doubt_reason`, no structure is excluded.
     """
     if headline.tolerant is not None:
-        excluded_names = headline.structures_with_status("excluded") if without_rival else ()
+        excluded_names = headline.structures_with_status("excluded") if doubt_reason is None else ()
         return (
             [f"Excluded by the losses: {_list_structures(excluded_names)}."]
             if excluded_names
@@ -122,7 +127,7 @@ def _damping_sentences(
         damping_phrase = damping_phrase.replace("only", "alone is sufficient")
     sentences = [f"{damping_phrase}. Numbers are those of type {headline.name}, all orders free."]
     excluded_names = headline.structures_with_status("excluded")
-    if headline.is_explained and without_rival and excluded_names:
+    if headline.is_explained and doubt_reason is None and excluded_names:
         sentences.append(f"Excluded: {_list_structures(excluded_names)}.")
     if headline.simpler is not None and headline.simpler.fixed:
         sentences.append(_conditional_sentence(headline.simpler))

@@ -33,6 +33,17 @@ def test_signal_without_gaps_is_unchanged():
 
 
 @pytest.mark.parametrize(
+    ("reach_s", "rate_hz"), [(1.0, 125.0), (0.27, 125.0), (0.15, 250.0), (0.02, 500.0), (0, 125.0)]
+)
+def test_short_filters_need_a_higher_rate(reach_s, rate_hz):
+    """The lowest rate if no filter is short enough."""
+    decimation = Decimation.with_half_length(1000.0, 50.0, reach_s)
+    assert decimation.rate_hz == rate_hz
+    if reach_s:
+        assert decimation.half_length_samples / rate_hz <= reach_s
+
+
+@pytest.mark.parametrize(
     ("rate_hz", "highest_hz", "factor"), [(1000, 50, 8), (1000, 20, 20), (250, 80, 1)]
 )
 def test_decimation_passes_only_the_band(rate_hz, highest_hz, factor):
