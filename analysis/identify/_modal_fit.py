@@ -259,6 +259,12 @@ class ModalFit(ModalEstimate):
             np.all(residue_variances <= _MAX_RELATIVE_RESIDUE_STD**2)
         )
 
+    @property
+    def has_damping_at_limit(self) -> bool:
+        """Return whether a visible mode has the largest damping of the search."""
+        visible_poles = (self.poles_rad_s[number] for number in self.visible_mode_numbers)
+        return any(-2 * pole.real > 0.999 * _MAX_LOSS_FACTOR * abs(pole) for pole in visible_poles)
+
     def plant_with_modal_frequencies(self, plant: Plant) -> Plant:
         """Return the plant with stiffnesses adjusted to the frequencies of the visible modes.
 

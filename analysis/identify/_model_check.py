@@ -17,6 +17,7 @@ from analysis.identify._visible_modes import visible_modes
 from analysis.identify.headline import (
     COARSE_ENCODER_REASON,
     CONTRADICTED_FILE_REASON,
+    DAMPING_AT_LIMIT_REASON,
     HIDDEN_RESPONSE_REASON,
     UNEXPLAINED_REASON,
 )
@@ -127,6 +128,8 @@ class ModelCheck:
             return other_reason
         if not self.modal_fit.determines_response:
             return HIDDEN_RESPONSE_REASON
+        if self.modal_fit.has_damping_at_limit:
+            return DAMPING_AT_LIMIT_REASON
         if _is_encoder_coarse(self.candidate_set.comparison, self.modal_fit):
             return COARSE_ENCODER_REASON
         return None

@@ -382,7 +382,7 @@ def _uniform_beam_test(
     """Test whether a uniform beam predicts the measured modes; None if there is no modal model."""
     if modal_fit is None:
         return None
-    if not modal_fit.determines_response:
+    if not modal_fit.determines_response or modal_fit.has_damping_at_limit:
         return UniformBeamTest.not_made(modal_fit)
     return uniform_beam_test(modal_fit, measurement.nominal_plant, measurement.axis_tilt_deg)
 

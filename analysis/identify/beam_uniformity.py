@@ -33,8 +33,8 @@ class UniformBeamTest:
     Attributes
     ----------
     status : str
-        "passed", "refused", or "not tested" if there are no degrees of freedom or if the residues
-        are not determined.
+        "passed", "refused", or "not tested" if there are no degrees of freedom or if the modes are
+        not determined.
     chi_square : float
         Weighted sum of squared differences between measured and predicted constants.
     degrees_of_freedom : int

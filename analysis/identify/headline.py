@@ -51,6 +51,11 @@ HIDDEN_RESPONSE_REASON: Final = (
 )
 """Reason against all numbers if the motor moves too early in the record, or too little."""
 
+DAMPING_AT_LIMIT_REASON: Final = (
+    "the damping ratio of a mode is at the edge of the range searched, 50 %"
+)
+"""Reason against all numbers if a mode may be damped more than any that is searched for."""
+
 COARSE_ENCODER_REASON: Final = (
     "at a sharp resonance, the steps of the encoder exceed the noise of the torque"
 )

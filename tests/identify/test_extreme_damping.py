@@ -1,4 +1,4 @@
-"""Resonances so sharp that the steps of the encoder exceed the noise of the torque there."""
+"""Beams with so little damping that the encoder is too coarse, or so much that they hardly ring."""
 
 from dataclasses import replace
 
@@ -44,3 +44,13 @@ def test_much_too_coarse_encoder_is_flagged(measured):
     assert all(mode.damping_ratio.flag == reason for mode in selection.headline.modes)
     assert all(parameter.flag for parameter in selection.headline.parameters.values())
     assert f"The residual is white, but {reason}." in selection.verdict.sentences
+
+
+@pytest.mark.fit
+def test_mode_beyond_the_searched_damping_is_flagged(responding, references, link):
+    damping = Damping(zeta=5e-4, alpha=1.0, gamma=1.0, lambda_=1.0)
+    session = responding(references(41_000), damping, link)
+    selection = select(session.measured(noise_nm=2e-3, seed=2))
+    assert selection.headline.modes[0].damping_ratio.flag.endswith("range searched, 50 %")
+    assert selection.headline.uniform_beam.status == "not tested"
+    assert not any("uniform" in sentence for sentence in selection.verdict.sentences)
