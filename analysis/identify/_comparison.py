@@ -665,18 +665,43 @@ class Comparison:
             )
         return total_gradient
 
-    def fill_unknown_torque(self, plant: Plant | ModalModel) -> Comparison:
+    def fill_unknown_torque(
+        self,
+        plant: Plant | ModalModel,
+        poles: Sequence[Pole],
+        amplitudes: NDArray[np.float64],
+    ) -> Comparison:
         """Return the comparison with unmeasured torque filled by a plant's prediction.
 
         The residual at the filled ticks then is 0. After convergence of the fit, the cost has the
         same minimum as the cost of the known samples alone.
+
+        Parameters
+        ----------
+        plant : Plant or ModalModel
+            Current estimate.
+        poles : sequence of Pole
+            Poles of the free decays, which continue in a gap.
+        amplitudes : ndarray, shape (m,)
+            Amplitudes of the spectra that `nuisance_spectra` returns.
         """
         is_torque_known = self.measurement.torque_known
         if is_torque_known.all():
             return self
+        unknown_ticks = np.flatnonzero(~is_torque_known)
+        unknown_times_s = unknown_ticks / self.measurement.rate_hz - self.first_sample_s
+        amplitudes_per_decay = count_decay_spectra(poles)
+        decay_torque_nm = np.zeros(unknown_ticks.size)
+        for decay_number, decay_spectra in enumerate(
+            (self.decay_spectra, *self.later_decay_spectra)
+        ):
+            decay_torque_nm += decay_spectra.torque_at(
+                unknown_times_s, poles, amplitudes[decay_number * amplitudes_per_decay :]
+            )
         filled_torque_nm = self.measurement.torque_nm.copy()
-        filled_torque_nm[~is_torque_known] = (
+        filled_torque_nm[unknown_ticks] = (
             self.removed_torque_in_gaps_nm
+            + decay_torque_nm
             + self.torque_predictor.torque_at_fine_samples(
                 plant,
                 self.decimation.downsampling_factor,

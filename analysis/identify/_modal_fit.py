@@ -416,7 +416,9 @@ class _ModalSearch:
             # A torque that the modal model lacks would change which part of the angle follows it.
             if not (len(search.effect_spectra) or comparison.drag):
                 comparison = comparison.with_reestimated_angle(modal_model, search.noise)
-            comparison = comparison.fill_unknown_torque(modal_model)
+            comparison = comparison.fill_unknown_torque(
+                modal_model, *problem.decays(search.mode_unknowns, linear_parameters)
+            )
             noise_power = smooth_power(residual_spectrum, has_narrow_blocks=True)
             noise_power = noise_power_with_peaks(
                 residual_spectrum,

@@ -366,8 +366,7 @@ class ModalProblem:
         model: ModalModel,
     ) -> NDArray[np.complex128]:
         """Return the residual spectrum of a model in N·m, not whitened, shape (K,)."""
-        nuisance_amplitudes = linear_parameters[mode_unknowns.size + BACKGROUND_COEFFICIENTS :]
-        poles = self._poles(mode_unknowns)
+        poles, nuisance_amplitudes = self.decays(mode_unknowns, linear_parameters)
         comparison = self._comparison
         predicted_nm = comparison.torque_predictor.torque(model)[0]
         modal_residual = comparison.spectrum(
@@ -376,6 +375,13 @@ class ModalProblem:
         if comparison.drag is not None:
             modal_residual += comparison.drag.torque_change_by_poles(poles, mode_unknowns.size)[0]
         return modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
+
+    def decays(
+        self, mode_unknowns: NDArray[np.float64], linear_parameters: NDArray[np.float64]
+    ) -> tuple[list[Pole], NDArray[np.float64]]:
+        """Return the poles of the free decays, and the amplitudes of all disturbances."""
+        amplitudes = linear_parameters[mode_unknowns.size + BACKGROUND_COEFFICIENTS :]
+        return self._poles(mode_unknowns), amplitudes
 
     def ringing(
         self, linear_parameters: NDArray[np.float64], covariance: NDArray[np.float64]

@@ -242,9 +242,9 @@ class Objective:
         find_minimum : Minimum
             Minimum of that objective.
         """
-        vector_of_unknowns = start_unknowns
+        objective, vector_of_unknowns = self, start_unknowns
         for _ in range(_MAX_TORQUE_FILLING_ROUNDS):
-            objective = self._fill_unknown_torque(vector_of_unknowns)
+            objective = objective._fill_unknown_torque(vector_of_unknowns, noise_weight)
             minimum = descend(
                 partial(objective.normal_equations, noise_weight=noise_weight),
                 vector_of_unknowns,
@@ -266,14 +266,21 @@ class Objective:
                 break
         return objective, minimum
 
-    def _fill_unknown_torque(self, vector_of_unknowns: NDArray[np.float64]) -> Objective:
+    def _fill_unknown_torque(
+        self, vector_of_unknowns: NDArray[np.float64], noise_weight: NDArray[np.float64]
+    ) -> Objective:
         """Return the objective with unmeasured torques filled by the prediction for given unknowns.
 
         Return `self` if all torques were measured.
         """
-        comparison = self.comparison.fill_unknown_torque(self.unknowns.plant(vector_of_unknowns))
-        if comparison is self.comparison:
+        if self.comparison.measurement.torque_known.all():
             return self
+        linearisation = self.linearise(vector_of_unknowns)
+        comparison = self.comparison.fill_unknown_torque(
+            self.unknowns.plant(vector_of_unknowns),
+            linearisation.poles,
+            self.project(linearisation, noise_weight).amplitudes,
+        )
         return Objective(comparison, self.unknowns, self.effect_spectra)
 
 

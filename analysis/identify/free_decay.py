@@ -95,6 +95,33 @@ class DecaySpectra:
         """
         return self._real_spectra(poles, self._transform_of_growing_decay)
 
+    def torque_at(
+        self,
+        time_s: NDArray[np.float64],
+        poles: Sequence[Pole],
+        amplitudes: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return the torque in N·m of decays with given amplitudes at given times, shape (n,).
+
+        Parameters
+        ----------
+        time_s : ndarray, shape (n,)
+            Times since the first sample, in seconds.
+        poles : sequence of Pole
+            Poles of the decays.
+        amplitudes : ndarray of float, shape (m,)
+            Amplitude of each decay spectrum, in N·m.
+        """
+        torque_nm = np.zeros(time_s.size)
+        amplitude_index = 0
+        for pole in poles:
+            decay = np.exp(pole.at_rad_s * time_s)
+            torque_nm += amplitudes[amplitude_index] * decay.real
+            if pole.oscillates:
+                torque_nm += amplitudes[amplitude_index + 1] * decay.imag
+            amplitude_index += 1 + pole.oscillates
+        return torque_nm
+
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
         """Return spectra of n oscillations over the whole record, shape (4 n, K).
 
@@ -170,7 +197,7 @@ class LaterDecaySpectra(DecaySpectra):
         Time between ticks.
     """
 
-    __slots__ = ("_first_tick_factor", "_tick_rotation", "_tick_s")
+    __slots__ = ("_first_tick_factor", "_start_s", "_tick_rotation", "_tick_s")
 
     def __init__(
         self,
@@ -181,12 +208,25 @@ class LaterDecaySpectra(DecaySpectra):
         tick_s: float,
     ) -> None:
         super().__init__(sample_count, rate_hz, omega_rad_s)
+        self._start_s = decay_start_s
         self._duration_s -= decay_start_s
         self._tick_s = tick_s
         self._tick_rotation = np.exp(-1j * omega_rad_s * tick_s)
         self._first_tick_factor = (
             tick_s / self._period_s * np.exp(-1j * omega_rad_s * decay_start_s)
         )
+
+    def torque_at(
+        self,
+        time_s: NDArray[np.float64],
+        poles: Sequence[Pole],
+        amplitudes: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        elapsed_s = time_s - self._start_s
+        has_begun = elapsed_s >= 0
+        torque_nm = np.zeros(time_s.size)
+        torque_nm[has_begun] = super().torque_at(elapsed_s[has_begun], poles, amplitudes)
+        return torque_nm
 
     def _transform_of_decay(self, pole: complex) -> NDArray[np.complex128]:
         """Return the transform of ``exp(p t)`` from the first tick to the last sample, (K,)."""

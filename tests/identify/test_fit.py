@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import SETTINGS, Comparison, MeasurementError, Objective, fit_record
+from analysis.identify import (
+    SETTINGS,
+    Comparison,
+    MeasurementError,
+    Objective,
+    fit_record,
+    select,
+)
 from analysis.identify.parametrization import StepRule, Unknowns
 from analysis.identify.residual_tests import whiteness
 from analysis.models import STRUCTURES
@@ -377,6 +384,21 @@ def test_a_narrower_band(sessions, true_parameters):
 def test_too_much_unknown(sessions, spoil, message):
     with pytest.raises(MeasurementError, match=rf"session.mcap.*{message}"):
         fit(sessions("VI").measured(**spoil), "III")
+
+
+def test_beam_that_rings_from_one_gap_to_the_next_causes_no_bias(sessions, plants, true_parameters):
+    """Eight gaps of 90 ms; mode 1 rings for seconds after each."""
+    starts = 3000 + 4000 * np.arange(8)
+    gaps = np.concatenate([np.arange(start, start + 90) for start in starts])
+    measured = sessions("VI").measured(noise_nm=1e-3, seed=5, unknown_angle=gaps)
+    selection = select(measured)
+    assert {finding.kind for finding in selection.verdict.findings} <= {"air drag"}
+    truth, plant = true_parameters("VI"), Plant(LINK, plants["VI"])
+    for mode, pole in zip(selection.headline.modes, plant.mode_poles(3), strict=True):
+        frequency_hz, ratio = mode.frequency_hz, mode.damping_ratio
+        assert abs(frequency_hz.value - pole.at_rad_s.imag / (2 * np.pi)) < 4 * frequency_hz.std
+        assert abs(ratio.value + pole.at_rad_s.real / abs(pole.at_rad_s)) < 4 * ratio.std
+    assert_within(fit(measured, "VI"), truth)
 
 
 def test_motion_in_an_angle_gap_causes_no_bias(sessions, moved_unseen, true_parameters):
