@@ -222,6 +222,7 @@ class LaterDecaySpectra(DecaySpectra):
         poles: Sequence[Pole],
         amplitudes: NDArray[np.float64],
     ) -> NDArray[np.float64]:
+        """Return the torque in N·m of decays with given amplitudes; 0 before they begin, (n,)."""
         elapsed_s = time_s - self._start_s
         has_begun = elapsed_s >= 0
         torque_nm = np.zeros(time_s.size)

@@ -403,7 +403,8 @@ def headline_of_fit(
         for parameter_name in (order_name, COEFFICIENT_OF[order_name])
     }
     if damping_reason or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
-        parameter_flags |= dict.fromkeys(BEAM_PARAMETERS, _NOT_SEPARABLE_FLAG)
+        # A delay turns the phase of a mode as its damping does.
+        parameter_flags |= dict.fromkeys((*BEAM_PARAMETERS, "delay_s"), _NOT_SEPARABLE_FLAG)
     return Headline(
         name=name,
         fit=fit,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Measurement, fit_record
+from analysis.identify import Measurement, fit_record, select
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
@@ -47,3 +47,10 @@ def test_frequency_and_damping_do_not_depend_on_the_band(fraction, within, band_
     mode = fit.modes[0]
     assert mode.frequency_hz == pytest.approx(FREQUENCY_HZ, abs=1e-3)
     assert mode.damping_ratio == pytest.approx(DAMPING_RATIO, abs=within)
+
+
+def test_delay_is_not_separable_from_the_damping_of_one_mode(sessions):
+    headline = select(sessions("VI").measured(noise_nm=5e-3, seed=1), band_hz=(5.0, 20.0)).headline
+    assert headline.visible_modes == (2,)
+    for name in ("delay_s", "density_over_stiffness", "bending_stiffness_n_m2"):
+        assert headline.parameters[name].flag is not None, name
