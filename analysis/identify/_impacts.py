@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
     from analysis.identify._data import Measurement
+    from analysis.identify._modal_fit import ModalFit
 
 _FREEST_STRUCTURE: Final = STRUCTURES["VI"]
 """Structure with both dampings and free orders."""
@@ -56,6 +57,13 @@ _MAX_POWER_BEFORE_OVER_AFTER: Final = 0.5
 
 _IMPACT_FIT_ROUNDS: Final = 2
 """Number of rounds that estimate poles and noise with the impact as part of the fit."""
+
+_MAX_FIRST_ORDER_POLE_CHANGE: Final = 0.05
+"""Difference of a pole from that of the decays after an impact, relative to the decay rate, up to
+which the decays are accurate to first order."""
+
+_MAX_RELATIVE_POLE_DISTANCE: Final = 0.1
+"""Largest distance between two poles of the same mode, relative to its frequency."""
 
 _MIN_EVIDENT_COST_FRACTION: Final = 0.8
 """Minimum fraction of the unexplained cost that an evident impact explains."""
@@ -240,6 +248,38 @@ def _refits_from_record_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
 def add_known_impact(measurement: Measurement, impact: DetectedImpact) -> Measurement:
     """Return the measurement with a detected impact added to its known impacts."""
     return replace(measurement, impacts=(*measurement.impacts, impact.impact))
+
+
+def with_fitted_impact_poles(measurement: Measurement, modal_fit: ModalFit) -> Measurement | None:
+    """Return the measurement with the poles of the fitted modes in its known impacts.
+
+    Return None if the fit would not change: the expansion of the decays to first order is valid for
+    differences that are small compared with the damping.
+    """
+    fitted_poles = tuple(modal_fit.poles_rad_s.values())
+
+    def fitted_pole(pole_rad_s: complex) -> complex:
+        """Return the fitted pole nearest to a pole, or the pole itself if none is near."""
+        nearest = min(fitted_poles, key=lambda fitted: abs(fitted - pole_rad_s))
+        is_near = abs(nearest - pole_rad_s) < _MAX_RELATIVE_POLE_DISTANCE * abs(pole_rad_s)
+        return nearest if pole_rad_s.imag and is_near else pole_rad_s
+
+    impacts = tuple(
+        replace(impact, poles_rad_s=tuple(map(fitted_pole, impact.poles_rad_s)))
+        for impact in measurement.impacts
+    )
+    largest_change = max(
+        (
+            abs(new_pole - pole) / max(abs(new_pole.real), abs(pole.real))
+            for new_impact, impact in zip(impacts, measurement.impacts, strict=True)
+            for new_pole, pole in zip(new_impact.poles_rad_s, impact.poles_rad_s, strict=True)
+            if new_pole != pole
+        ),
+        default=0.0,
+    )
+    if largest_change < _MAX_FIRST_ORDER_POLE_CHANGE:
+        return None
+    return replace(measurement, impacts=impacts)
 
 
 def impact_findings(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from analysis.identify._candidates import CandidateSet
@@ -18,7 +19,12 @@ from analysis.identify._drag import (
 from analysis.identify._explanations import explanations
 from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._fit import BAND_HZ
-from analysis.identify._impacts import MAX_IMPACTS, add_known_impact, find_impacts
+from analysis.identify._impacts import (
+    MAX_IMPACTS,
+    add_known_impact,
+    find_impacts,
+    with_fitted_impact_poles,
+)
 from analysis.identify._model_check import (
     MODES_WITHOUT_REDUNDANCY,
     ModelCheck,
@@ -83,6 +89,9 @@ session repeats."""
 ORDER_ONE_STRUCTURE: Final = STRUCTURES["III"]
 """Structure with internal and external damping of order 1. It is fitted from every start: it has no
 local minima by undetermined orders, and no damping that is in fact a stiffness or an inertia."""
+
+_MAX_IMPACT_POLE_UPDATES: Final = 4
+"""Maximum number of updates of the poles of the decays after an impact."""
 
 _FINDING_KINDS_AGAINST_IMPACT_SEARCH: Final = frozenset({"sign", "unit", "clipping", "stop"})
 """Findings that make a search for impacts useless. "implausible" is not one of them, since a large
@@ -215,7 +224,8 @@ def _assess_with_impacts(
     is the selection for a measurement whose known impacts are fitted. Return its result with all
     added impacts, or that without impacts if none was added.
     """
-    assessment = assess_measurement(measurement)
+    assess_with_fitted_poles = partial(_assess_with_fitted_poles, assess_measurement)
+    assessment = assess_with_fitted_poles(measurement)
     for _ in range(MAX_IMPACTS):
         if assessment.residual_is_noise or not _FINDING_KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(
             assessment.model_check.finding_kinds
@@ -227,7 +237,7 @@ def _assess_with_impacts(
         for impact in find_impacts(
             candidate_set, only_obvious="harmonics" in assessment.model_check.finding_kinds
         ):
-            impact_assessment = assess_measurement(
+            impact_assessment = assess_with_fitted_poles(
                 add_known_impact(candidate_set.comparison.measurement, impact)
             )
             if impact_assessment.residual_is_noise or impact.is_evident:
@@ -237,6 +247,28 @@ def _assess_with_impacts(
         if better_assessment is None:
             break
         assessment = better_assessment
+    return assessment
+
+
+def _assess_with_fitted_poles(
+    assess_measurement: Callable[[Measurement], _Assessment[_ResultT]], measurement: Measurement
+) -> _Assessment[_ResultT]:
+    """Select the model of a record; the decays after its impacts get the poles of the modes.
+
+    An impact is found with the poles of a fit that it biased.
+    """
+    assessment = assess_measurement(measurement)
+    for _ in range(_MAX_IMPACT_POLE_UPDATES):
+        modal_fit = assessment.model_check.modal_fit
+        # The poles of a model that does not explain the record may be any.
+        if modal_fit is None or not assessment.residual_is_noise:
+            break
+        # The assessment may have found an impact itself.
+        measurement = assessment.model_check.candidate_set.comparison.measurement
+        updated_measurement = with_fitted_impact_poles(measurement, modal_fit)
+        if updated_measurement is None:
+            break
+        assessment = assess_measurement(updated_measurement)
     return assessment
 
 

@@ -73,6 +73,10 @@ _NOT_IDENTIFIABLE_FLAG: Final = "not identifiable from this record"
 _AT_BOUND_FLAG: Final = "at the edge of the range searched"
 """Flag of a parameter that rests on a bound."""
 
+_DAMPING_ORDER_LIMITS: Final = (0.3, 1.7)
+"""Orders beyond which a damping whose order is not determined acts as a stiffness (order 0) or as a
+mass (order 2): the values of the beam then are those without it, and can be wrong by any factor."""
+
 _MODES_TO_SEPARATE_DAMPINGS: Final = 2
 """Number of visible modes from which internal and external damping are separable."""
 
@@ -402,9 +406,24 @@ def headline_of_fit(
         for order_name, order_reason in order_reasons.items()
         for parameter_name in (order_name, COEFFICIENT_OF[order_name])
     }
-    if damping_reason or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
+    lowest_order, highest_order = _DAMPING_ORDER_LIMITS
+    acts_as_stiffness_or_mass = any(
+        not lowest_order < fit.parameters[order_name] < highest_order
+        for order_name in order_reasons
+    )
+    if (
+        damping_reason
+        or acts_as_stiffness_or_mass
+        or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds)
+    ):
         # A delay turns the phase of a mode as its damping does.
         parameter_flags |= dict.fromkeys((*BEAM_PARAMETERS, "delay_s"), _NOT_SEPARABLE_FLAG)
+    if acts_as_stiffness_or_mass:
+        # The other damping is relative to that stiffness or mass.
+        parameter_flags = {
+            **dict.fromkeys((*COEFFICIENT_OF, *COEFFICIENT_OF.values()), _NOT_SEPARABLE_FLAG),
+            **parameter_flags,
+        }
     return Headline(
         name=name,
         fit=fit,
