@@ -1,5 +1,8 @@
 """Steps of the motor: no false finding; orders that one mode does not determine are reported."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from analysis.identify import fit_freest_alone, select
@@ -65,6 +68,17 @@ def test_step_without_a_rest_determines_nothing_but_the_decay(steps, link, plant
     pole = Plant(link, plants["III"]).mode_poles(1)[0].at_rad_s
     assert headline.modes[0].damping_ratio.value == pytest.approx(-pole.real / abs(pole), rel=0.1)
     assert fit_freest_alone(measured)[1] == (found,)
+
+
+def test_damping_that_acts_as_a_stiffness_makes_the_beam_undetermined(steps):
+    """In this record the order of the internal damping falls to 0, and EI to a hundredth."""
+    step = steps("VI", 0.01, rest_s=0.6, held_s=8.0)
+    rounded = replace(step, angle_rad=7e-5 * np.round(step.angle_rad / 7e-5))
+    selection = select(rounded.measured(noise_nm=2e-3, seed=7))
+    parameters = selection.headline.parameters
+    assert parameters["bending_stiffness_n_m2"].value < 0.01
+    assert all(parameters[name].flag for name in parameters if name != "tool_inertia_kg_m2")
+    assert not any("stiffness (EI)" in sentence for sentence in selection.verdict.sentences)
 
 
 @pytest.mark.further  # the profile's parts are in test_profile_valleys.py
