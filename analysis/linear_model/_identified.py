@@ -359,7 +359,11 @@ def read_identified_model(path: Path | str) -> IdentifiedModel:
         for document_entry in list_entries("files")
     }
     (length_m,) = lengths_m if len(lengths_m) == 1 else (None,)
-    stated_bands = [document_entry.get("band_hz") for document_entry in list_entries("records")]
+    # A campaign, which lists no records, states the band of all sessions among its settings.
+    campaign_settings = document.get("settings")
+    stated_bands = [document_entry.get("band_hz") for document_entry in list_entries("records")] + (
+        [campaign_settings.get("record_band_hz")] if isinstance(campaign_settings, dict) else []
+    )
     return IdentifiedModel(
         path.name,
         headline_name,

@@ -35,11 +35,11 @@ def campaign_document(
     dict
         ``headlines`` of each session and, with ``file`` null, of all sessions together;
         ``validity`` of the linear model for the least valid session; ``verdict`` on all sessions
-        (null without whole-record estimates); ``files`` with the verdict on each; ``errors`` (files
-        that are left out, with reasons); ``is_one_specimen``, and the ``groups`` of sessions if
-        they are not of one specimen; ``trials`` of the validation: how many were requested,
-        completed and lost; ``fits`` and ``modes`` of single sessions; and the tables by the names
-        of their CSV files. All numbers are finite.
+        (null without whole-record estimates); ``files`` with the length of the beam and the verdict
+        on each; ``errors`` (files that are left out, with reasons); ``one_specimen``, and the
+        ``groups`` of sessions if they are not of one specimen; ``trials`` of the validation: how
+        many were requested, completed and lost; ``fits`` and ``modes`` of single sessions; and the
+        tables by the names of their CSV files. All numbers are finite.
     """
     leading_quantity = campaign.homogeneity.leading_scatter
     document_content: dict[str, Any] = finite_json(
@@ -52,6 +52,7 @@ def campaign_document(
             "files": [
                 {
                     **session_analysis.source.as_json(),
+                    "beam_length_m": session_analysis.beam.length_m,
                     "validity": session_analysis.validity.as_json(),
                     "warnings": session_analysis.warnings,
                     "welch_segments": session_analysis.segments or None,

@@ -11,11 +11,13 @@ from PIL import Image
 from analysis.campaigns import CampaignError, SessionTask, analyse_session, campaign
 from analysis.campaigns._validation import leave_one_out_results, models_without_session
 from analysis.campaigns.workers import process_pool
+from analysis.exchange import export_model
 from analysis.identify import BAND_HZ, Measurement, fit_record
+from analysis.linear_model import ModelOptions
 from analysis.models import STRUCTURES
 from analysis.record import load_record
 from analysis.record_part import RecordSource
-from analysis.report import campaign_document
+from analysis.report import campaign_document, document_text
 from analysis.report._campaign_tables import (
     all_tables,
     headline_tables,
@@ -117,6 +119,29 @@ FIGURES = (
     "figure5_signals", "figure6_nominal", "figure7_indices", "figure8_best", "pooled",
     "validation", "damping", "pooled_response",
 )  # fmt: skip
+
+
+def test_document_is_exported_as_a_linear_model_with_the_pooled_modes(done, truth, tmp_path):
+    found, _ = done
+    source = tmp_path / "campaign.json"
+    source.write_text(document_text(campaign_document(found)))
+    (*_, pooled) = json.loads(source.read_text())["headlines"]
+    assert pooled["file"] is None
+    beam = export_model(
+        source, tmp_path / "beam.npz", ModelOptions(beam=True, posterior_sample_count=2)
+    )
+    assert beam.identified.length_m == truth[0].length_m
+    with np.load(tmp_path / "beam.npz") as file:
+        states, resonances = np.linalg.eigvals(file["A"]), file["poles_rad_s"]
+    assert len(pooled["modes"]) == len(resonances) == 3
+    for mode in pooled["modes"]:
+        frequency_hz, damping = mode["frequency_hz"]["value"], mode["damping_ratio"]
+        for poles, accuracy in ((states, 1e-3), (resonances, 1e-9)):  # 1e-3: not quite uniform
+            pole = poles[np.argmin(np.abs(poles.imag - 2 * np.pi * frequency_hz))]
+            assert pole.imag / (2 * np.pi) == pytest.approx(frequency_hz, rel=accuracy)
+            low, high = damping["interval_95"]
+            assert low < -pole.real / abs(pole) < high
+        assert -pole.real / abs(pole) == pytest.approx(damping["value"], rel=1e-9)
 
 
 @pytest.mark.further  # as figures of a report

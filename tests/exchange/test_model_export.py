@@ -339,6 +339,28 @@ def test_exact_beam_is_used_if_its_covariance_is_stated(exported):
     np.testing.assert_allclose(response(model, frequency_hz), true, rtol=2e-3)
 
 
+@pytest.mark.parametrize("gate", ["passed", "refused"])
+def test_pooled_result_of_a_campaign_is_exported(exported, gate):
+    values = NOMINAL | {"density_over_stiffness": 0.0521}
+    (single,) = document()["headlines"]
+    (pooled,) = document(values, gate=gate, file=None)["headlines"]
+    files = ("a.mcap", "b.mcap")
+    content = {
+        "files": [{"file": file, "beam_length_m": LENGTH_M} for file in files],
+        "settings": {"record_band_hz": [2.0, 40.0]},
+        "headlines": [*(single | {"file": file} for file in files), pooled],
+    }
+    model = exported(content, "--samples", 0)
+    if gate == "passed":
+        assert model["model"] == "beam"
+        frequency_hz = np.geomspace(*BAND_HZ, 500)
+        true = exact(values, 2j * np.pi * frequency_hz)
+        np.testing.assert_allclose(response(model, frequency_hz), true, rtol=2e-3)
+    else:
+        assert model["model"] == "modal"
+        assert model["band_hz"].tolist() == [2.0, 40.0]
+
+
 def test_the_summary_has_a_line_for_each_statement(export):
     result = export(document(), "model.npz", "--rate", 1000, *FEW)
     assert result.stderr == ""
