@@ -67,14 +67,21 @@ _FINDINGS_IN_ESTIMATES: Final = frozenset(
 
 Doubtful numbers are flagged."""
 
+_MAX_SENTENCE_LENGTH: Final = 300
+"""Number of characters of a finding's sentence that are quoted in messages and notes."""
+
+_DRAG_FINDING: Final = "air drag"
+"""Kind of the finding that air drag acts on the beam."""
+
 _FINDINGS_IN_PARAMETERS: Final = frozenset(
     {
-        *("delay", "tool inertia", "beam data", "air drag", "rival explanations"),
+        *("delay", "tool inertia", "beam data", _DRAG_FINDING, "rival explanations"),
         # From analyses with model variants other than the uniform beam:
         *("not uniform", "elastic clamp", "tip mass", "torque filter"),
     }
 )
-"""Kinds of findings whose magnitude is among the parameters."""
+"""Kinds of findings whose magnitude is among the parameters, except for air drag that was fitted
+with the modes."""
 
 
 class IdentifiedBeamError(UserError, ValueError):
@@ -180,7 +187,7 @@ def read_identified_beam(
             "uniform beam; remove what makes it differ (a mass, a soft clamp, an axis that is "
             "not plumb), and record and analyze again, or leave out --model."
         )
-    _require_known_findings(headline_label, headline.get("named"), use)
+    _require_known_findings(headline_label, headline, use)
     exact_geometry = headline.get("exact_geometry")
     if not refusal and isinstance(exact_geometry, dict):
         headline_label, headline = f"{headline_label}.exact_geometry", exact_geometry
@@ -421,26 +428,30 @@ def parameter_estimates(headline_label: str, parameter_documents: object) -> dic
     return estimates
 
 
-def findings_without_parameter(named_findings: object) -> list[tuple[int, str, str]]:
+def findings_without_parameter(headline: Mapping[str, Any]) -> list[tuple[int, str, str]]:
     """Return the findings of an analysis whose effect no parameter describes.
 
     Each one is a tuple of index, kind and sentence. Findings that concern only the record and not
-    the antenna are omitted.
+    the antenna are omitted. Air drag has no parameter if it was fitted with the modes. It is then
+    included if it has a size: without one, it is not significant.
 
     Parameters
     ----------
-    named_findings
-        List ``named`` of a headline.
+    headline
+        Headline of an analysis, with its list ``named``.
     """
+    named_findings, parameter_documents = headline.get("named"), headline.get("parameters")
+    has_drag_parameter = isinstance(parameter_documents, dict) and "drag" in parameter_documents
     findings = (
         (index, finding if isinstance(finding, dict) else {})
         for index, finding in enumerate(named_findings if isinstance(named_findings, list) else [])
     )
     return [
-        (index, kind[:60], str(finding.get("sentence"))[:200])
+        (index, kind[:60], str(finding.get("sentence"))[:_MAX_SENTENCE_LENGTH])
         for index, finding in findings
         if (kind := str(finding.get("what")))
         not in _FINDINGS_IN_ESTIMATES | _FINDINGS_IN_PARAMETERS
+        or (kind == _DRAG_FINDING and finding.get("value") is not None and not has_drag_parameter)
     ]
 
 
@@ -509,13 +520,17 @@ def _require_known_effects(
         )
 
 
-def _require_known_findings(headline_label: str, named_findings: object, use: BeamUse) -> None:
+def _require_known_findings(headline_label: str, headline: Mapping[str, Any], use: BeamUse) -> None:
     """Raise IdentifiedBeamError if no parameter describes a finding of the analysis."""
-    for finding_index, finding_kind, sentence in findings_without_parameter(named_findings):
+    for finding_index, finding_kind, sentence in findings_without_parameter(headline):
+        remedy = (
+            _EFFECTS_BY_PARAMETER["drag"][1]
+            if finding_kind == _DRAG_FINDING
+            else "remove its cause, and record and analyze again, or leave out --model"
+        )
         raise IdentifiedBeamError(
             f"{headline_label}.named[{finding_index}]: {finding_kind}, which {use.name} does not "
-            f"take into account ({sentence}); remove its cause, and record and analyze again, or "
-            "leave out --model."
+            f"take into account ({sentence}); {remedy}."
         )
 
 

@@ -136,6 +136,19 @@ def test_findings_without_a_parameter_are_refused(analysed, use, what, accepted)
         assert f"named[1]: {what}, which {use.name} does not take" in refusal(path, use)
 
 
+@pytest.mark.parametrize("use", [MOVE_USE, TOUCH_USE])
+def test_significant_air_drag_without_a_parameter_is_refused(analysed, use):
+    drag = {"what": "air drag", "value": 2.3e-3, "interval_95": None, "sentence": "Drag acts."}
+    refused = refusal(changed(analysed(), named=[drag]), use)
+    assert f"named[0]: air drag, which {use.name} does not take" in refused
+    assert "(Drag acts.); leave --model out" in refused
+    # Without a size it is not significant.
+    read_identified_beam(changed(analysed(), named=[drag | {"value": None}]), STATED, use)
+    # The message names the parameter if there is one.
+    described = changed(analysed(drag={"value": 2.3e-3}), named=[drag])
+    assert "drag.value = 0.0023 m: the analysis found drag" in refusal(described, use)
+
+
 @pytest.mark.parametrize("stated", [{"status": "refused"}, {"status": []}, [], "passed"])
 def test_unreadable_uniformity_test_is_refused(analysed, stated):
     path = changed(analysed(), validity={"uniform_beam": stated})

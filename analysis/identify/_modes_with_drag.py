@@ -25,7 +25,9 @@ import numpy as np
 from analysis.identify._finding import Finding
 from analysis.identify._modal_fit import fit_modes, fit_with_given_poles
 from analysis.identify.drag_torque import DragError, DragLaw
-from rigd.units import rounded_to_uncertainty
+from analysis.identify.residual_tests import SIGNIFICANT_STD
+from analysis.statistics import NORMAL_95
+from rigd.units import interval_text, rounded_to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -111,11 +113,35 @@ class ModesWithDrag:
             np.concatenate([self.drag_spectra, effect_spectrum[None]]),
         )
 
+    @property
+    def is_significant(self) -> bool:
+        """Return whether C_D d exceeds 0 by more than chance explains."""
+        return self.law.constant_m > SIGNIFICANT_STD * self.drag_std_m
+
     def finding(self) -> Finding:
-        """Return the finding that the damping ratios are those without air, and less certain."""
-        drag_mm, std_mm = rounded_to_uncertainty(
-            (self.law.constant_m, self.drag_std_m), self.drag_std_m, 1e3
-        )
+        """Return the finding that the damping ratios are those without air, and less certain.
+
+        If C_D d is significant, the finding has its value and interval.
+        """
+        drag_m, std_m = self.law.constant_m, self.drag_std_m
+        remedy = "Repeat the session at twice and at half the amplitude."
+        if self.is_significant:
+            interval_95_m = (drag_m - NORMAL_95 * std_m, drag_m + NORMAL_95 * std_m)
+            (drag_mm,) = rounded_to_uncertainty((drag_m,), NORMAL_95 * std_m, 1e3)
+            return Finding(
+                kind="air drag",
+                sentence=(
+                    f"Air drag acts on the beam: C_D d = {drag_mm} mm "
+                    f"({interval_text(interval_95_m, 1e3)} mm; 95 %), so damping grows with the "
+                    "amplitude. Drag was fitted with the modes; damping ratios are those without "
+                    "air."
+                ),
+                value=drag_m,
+                interval=interval_95_m,
+                unit="m",
+                remedy=remedy,
+            )
+        drag_mm, std_mm = rounded_to_uncertainty((drag_m, std_m), std_m, 1e3)
         return Finding(
             kind="air drag",
             sentence=(
@@ -123,7 +149,7 @@ class ModesWithDrag:
                 f"distinguishes drag from other damping: C_D d = {drag_mm} ± {std_mm} mm "
                 "(standard deviation). Damping ratios are those without air."
             ),
-            remedy="Repeat the session at twice and at half the amplitude.",
+            remedy=remedy,
         )
 
 

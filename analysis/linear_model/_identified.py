@@ -18,7 +18,7 @@ from analysis.linear_model._dynamics import (
 )
 from analysis.linear_model._modal_constants import constant_value, with_changed_constants
 from rigd.beam import OFFSET_PREFIX, Plant, parameter_named
-from rigd.estimates import modes_from_json
+from rigd.estimates import Estimate, modes_from_json
 from rigd.identified_beam import (
     findings_without_parameter,
     parameter_estimates,
@@ -30,7 +30,7 @@ from rigd.session import BeamUniformity
 from rigd.units import finite_number, is_usable_size
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -134,29 +134,33 @@ class IdentifiedModel:
         note_texts = (
             [f"flagged by the analysis: {', '.join(flagged_names)}"] if flagged_names else []
         )
-        note_texts += [
-            f"{parameter_name} is not part of the model: {why}"
-            for parameter_name, why in _OMISSION_REASONS_BY_PARAMETER.items()
-            if parameter_name in estimates and estimates[parameter_name].value
-        ]
-        effect_entries = self.headline.get("named")
-        note_texts += [
-            f"not part of the model: {effect_kind} ({effect_sentence.removesuffix('.')})"
-            for _, effect_kind, effect_sentence in findings_without_parameter(effect_entries)
-        ]
-        return tuple(note_texts)
+        return (*note_texts, *self._omitted_effects(estimates))
 
     @property
     def modal_notes(self) -> tuple[str, ...]:
-        """Return a note on the doubtful modes of the modal model, if there are any."""
+        """Return a note on doubtful modes of the modal model, and effects that it leaves out."""
         flagged_modes = [
             str(mode.number)
             for mode in modes_from_json(self.headline.get("modes"))
             if mode.source == "modal" and mode.flag
         ]
-        return (
-            (f"flagged by the analysis: mode {', '.join(flagged_modes)}",) if flagged_modes else ()
+        note_texts = (
+            [f"flagged by the analysis: mode {', '.join(flagged_modes)}"] if flagged_modes else []
         )
+        estimates = {
+            name: estimate
+            for name, parameter_document in self.headline["parameters"].items()
+            if (estimate := Estimate.from_json(parameter_document)) is not None
+        }
+        return (*note_texts, *self._omitted_effects(estimates))
+
+    def _omitted_effects(self, estimates: Mapping[str, Estimate]) -> Iterator[str]:
+        """Yield a note on each effect that the analysis found and no linear model contains."""
+        for parameter_name, omission_reason in _OMISSION_REASONS_BY_PARAMETER.items():
+            if parameter_name in estimates and estimates[parameter_name].value:
+                yield f"{parameter_name} is not part of the model: {omission_reason}"
+        for _, effect_kind, effect_sentence in findings_without_parameter(self.headline):
+            yield f"not part of the model: {effect_kind} ({effect_sentence.removesuffix('.')})"
 
     @property
     def _beam_part(self) -> Mapping[str, Any]:

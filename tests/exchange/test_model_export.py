@@ -329,6 +329,30 @@ def test_beam_is_exported_on_request_with_its_doubts(export, exported):
         assert words in result.stdout
 
 
+@pytest.mark.parametrize("gate", ["passed", "refused"])
+def test_air_drag_that_was_fitted_with_the_modes_is_noted(exported, gate):
+    drag = {"what": "air drag", "value": 2.3e-3, "sentence": "Air drag acts."}
+    model = exported(document(gate=gate, named=[drag]), *FEW)
+    assert model["model"] == ("beam" if gate == "passed" else "modal")
+    assert model["notes"].tolist() == ["not part of the model: air drag (Air drag acts)"]
+    uncertain = document(gate=gate, named=[drag | {"value": None}])
+    assert exported(uncertain, *FEW, name="uncertain.npz")["notes"].tolist() == []
+
+
+def test_effects_that_were_found_are_noted_for_a_modal_model(exported):
+    parameters = {name: {"value": value, "flag": None} for name, value in NOMINAL.items()}
+    parameters["drag"] = {"value": 1e-3, "flag": None}
+    named = [
+        {"what": "air drag", "value": 1e-3, "sentence": "Air drag acts."},
+        {"what": "soft stiffness", "sentence": "It softens."},
+    ]
+    model = exported(document(gate="refused", parameters=parameters, named=named), *FEW)
+    assert model["notes"].tolist() == [
+        "drag is not part of the model: the drag of the air grows with the amplitude",
+        "not part of the model: soft stiffness (It softens)",
+    ]
+
+
 def test_exact_beam_is_used_if_its_covariance_is_stated(exported):
     other = NOMINAL | {"density_over_stiffness": 0.0521}
     block = document(other)["headlines"][0]

@@ -35,8 +35,8 @@ def bursts_of_modes(responding, plants, link):
     return responding(reference_rad, plants["III"], link)
 
 
-def judged(session, seed):
-    measurement = replace(session.measured(noise_nm=NOISE_NM, seed=seed), uniformity=1e-3)
+def judged(session, seed, noise_nm=NOISE_NM):
+    measurement = replace(session.measured(noise_nm=noise_nm, seed=seed), uniformity=1e-3)
     return select(measurement)
 
 
@@ -57,6 +57,24 @@ def test_damping_ratios_are_those_without_air(bursts_of_modes, brake, plants, li
     assert selection.verdict.adequate
     (finding,) = (each for each in selection.verdict.findings if each.kind == "air drag")
     assert "without air" in finding.sentence
+    assert "hardly distinguishes drag" in finding.sentence
+    assert (finding.value, finding.interval) == (None, None)
+
+
+def test_significant_drag_is_found_with_its_size(bursts_of_modes, brake, plants, link):
+    drag_m = 2 * DRAG_M
+    drag_nm = brake.drag_torque(bursts_of_modes.angle_rad, RATE_HZ, link, plants["III"], drag_m)
+    braked = replace(bursts_of_modes, torque_nm=bursts_of_modes.torque_nm + drag_nm)
+    selection = judged(braked, 7, noise_nm=NOISE_NM / 3)
+    assert np.abs(deviations(selection, plants, link)).max() < 3.5
+    (finding,) = (each for each in selection.verdict.findings if each.kind == "air drag")
+    assert finding.sentence.startswith("Air drag acts on the beam: C_D d = ")
+    assert "mm; 95 %), so damping grows with the amplitude." in finding.sentence
+    assert finding.sentence.endswith("damping ratios are those without air.")
+    assert finding.unit == "m"
+    low_m, high_m = finding.interval
+    assert low_m < drag_m < high_m
+    assert finding.value == pytest.approx((low_m + high_m) / 2)
 
 
 @pytest.mark.further  # that no drag is found is in test_drag.py
