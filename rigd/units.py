@@ -43,6 +43,13 @@ _MAX_DECIMALS: Final = 9
 """Largest number of decimals; smaller uncertainties are written with an exponent."""
 
 
+_MAX_INTERVAL_ASYMMETRY: Final = 0.1
+"""Asymmetry of an interval above which its ends are written instead of value and half-width.
+
+The asymmetry is the distance of the value from the middle of the interval, relative to its length.
+"""
+
+
 def suffix_of(quantity_key: str) -> str:
     """Return the suffix of a key that names its unit, or "" if there is none.
 
@@ -146,6 +153,33 @@ def interval_text(interval: Sequence[float], scale: float = 1.0, sign_format: st
     """
     half_width = (interval[1] - interval[0]) / 2
     return " to ".join(rounded_to_uncertainty(interval, half_width, scale, sign_format))
+
+
+def with_interval(value: float, interval: Sequence[float] | None) -> str:
+    """Format a number with its interval: as ± if this is symmetric, otherwise as its two ends.
+
+    The ± of an asymmetric interval would exclude values that the interval contains, and include
+    others, such as a negative stiffness.
+
+    Parameters
+    ----------
+    value
+        Number to format.
+    interval
+        Lower and upper limit of the number, or None if they are unknown.
+
+    Examples
+    --------
+    >>> print(with_interval(43.3, (12.1, 74.7)), "or", with_interval(43.3, (16.3, 127.1)))
+    43 ± 31 or 16 to 127
+    """
+    if interval is None:
+        return with_half_width(value, None)
+    lower_limit, upper_limit = interval
+    distance_from_middle = abs(value - (lower_limit + upper_limit) / 2)
+    if distance_from_middle > _MAX_INTERVAL_ASYMMETRY * (upper_limit - lower_limit):
+        return interval_text(interval)
+    return with_half_width(value, interval)
 
 
 def with_percentage(std: float, value: float) -> str:

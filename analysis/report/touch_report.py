@@ -9,7 +9,7 @@ from analysis.report._document import document_text, program_versions
 from analysis.report.folder import write_new_file
 from analysis.report.table import TEXT_FORMAT, Cell, Column, Entry, Table, csv_text, number_cell
 from analysis.results import finite_json
-from rigd.units import decimals, with_half_width
+from rigd.units import with_interval
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from analysis.touch import SessionTouches, Touch
     from rigd.touch import TouchQuantity
 
-_MAX_INTERVAL_ASYMMETRY = 0.25
-"""Asymmetry of an interval above which its ends are shown instead of value and half-width.
-
-The asymmetry is the distance of the value from the interval's middle, relative to its length."""
 _DESCRIPTION_BY_KIND = {
     "rigid": "obstacle at rest",
     "yielding": "obstacle that gives way",
@@ -101,18 +97,8 @@ def _estimate_cell(estimated_quantity: TouchQuantity | None, display_offset: flo
     lower_limit, upper_limit = (
         interval_limit + display_offset for interval_limit in estimated_quantity.interval_95
     )
-    if abs(shown_value - (lower_limit + upper_limit) / 2) > _MAX_INTERVAL_ASYMMETRY * (
-        upper_limit - lower_limit
-    ):
-        decimal_digits = decimals((upper_limit - lower_limit) / 2)
-        return Cell(
-            shown_value,
-            f"{lower_limit:.{decimal_digits}f} to {upper_limit:.{decimal_digits}f}".replace(
-                "-", "−"
-            ),
-        )
     return Cell(
-        shown_value, with_half_width(shown_value, (lower_limit, upper_limit)).replace("-", "−")
+        shown_value, with_interval(shown_value, (lower_limit, upper_limit)).replace("-", "−")
     )
 
 

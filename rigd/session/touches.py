@@ -10,7 +10,7 @@ from math import isfinite, nan
 from typing import Any, Final
 
 from rigd.session.layout import pack_touch
-from rigd.units import with_half_width
+from rigd.units import with_interval
 
 _QUANTITY_UNITS: Final = {
     "x_m": "m from the axis",
@@ -97,7 +97,7 @@ def touch_line(touch: Mapping[str, Any]) -> str:
         Touch as in JSON documents and from `touches_of`.
     """
     quantity_texts = [
-        f"{with_half_width(estimate['value'], estimate['interval_95'])} {unit_text}"
+        f"{with_interval(estimate['value'], estimate['interval_95'])} {unit_text}"
         for quantity_name, unit_text in _QUANTITY_UNITS.items()
         if (estimate := touch.get(quantity_name)) is not None
     ]

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping, DeflectionFilter, undamped_frequencies_rad_s
-from rigd.units import with_half_width
+from rigd.units import with_interval
 from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, VERMILION, Color, Drawing
 
 if TYPE_CHECKING:
@@ -322,7 +322,7 @@ def touch_label(touch: Mapping[str, Any]) -> str:
     touch_position = touch["x_m"]
     return (
         f"touch {touch['number']}: "
-        f"{with_half_width(touch_position['value'], touch_position['interval_95'])} m"
+        f"{with_interval(touch_position['value'], touch_position['interval_95'])} m"
     )
 
 

@@ -39,6 +39,13 @@ def test_touches_are_written_at_the_end_and_read_back(kit, tmp_path):
     assert len(read_session(tmp_path / "a.mcap").samples) == 600
 
 
+def test_ends_of_an_asymmetric_interval_are_written():
+    stiffness = {"value": 43296.0, "std": 28263.0, "interval_95": [16341.0, 127134.0]}
+    line = touch_line(TOUCH | {"stiffness_n_per_m": stiffness})
+    assert "0.6200 ± 0.0020 m from the axis" in line
+    assert "16341 to 127134 N/m, rigid" in line
+
+
 def test_a_session_without_touches(kit, tmp_path):
     writer = kit.begin(tmp_path / "a.mcap")
     writer.close(kit.OUTCOME)
