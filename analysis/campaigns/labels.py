@@ -93,6 +93,18 @@ def format_percent(fraction: float) -> str:
     return "> 99.9 %" if fraction > 0.999 else f"{100 * fraction:.3g} %"
 
 
+def format_hours(hours: float) -> str:
+    """Format a duration in hours, or in minutes if it is shorter than an hour.
+
+    Examples
+    --------
+    >>> from analysis.campaigns.labels import format_hours
+    >>> format_hours(0.0336), format_hours(9.75)
+    ('2.02 min', '9.75 h')
+    """
+    return f"{60 * hours:.3g} min" if hours < 1 else f"{hours:.3g} h"
+
+
 def join_first_texts(texts: Sequence[str], separator: str = ", ") -> str:
     """List the first five texts and the number of the others.
 

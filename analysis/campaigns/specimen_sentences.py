@@ -8,6 +8,7 @@ import numpy as np
 
 from analysis.campaigns._experiment import differing_fact_keys, fact_text
 from analysis.campaigns.labels import (
+    format_hours,
     format_p_value,
     format_percent,
     join_first_texts,
@@ -43,6 +44,11 @@ stiffness of steel by 0.3 %."""
 _MIN_SESSIONS_WITH_CERTAIN_GROUPS: Final = 12
 """Smallest number of sessions whose groups are stated as a fact: of fewer than twelve sessions from
 one normal distribution, 3 to 38 % have clear gaps."""
+
+
+_MIN_RATE_DURATION_H: Final = 1.0
+"""Duration in hours from which a change is stated per hour. A change within a shorter time is
+stated as such: per hour it would be an extrapolation."""
 
 
 def describe_specimens(homogeneity: Homogeneity) -> list[str]:
@@ -88,28 +94,37 @@ def describe_trends(homogeneity: Homogeneity) -> list[str]:
         return []
     covered_h = max(trend.covered_h for _, trend, _ in significant_trends or trends)
     if significant_trends:
-        slopes_text = "; ".join(_slope_text(name, trend) for name, trend, _ in significant_trends)
+        changes_text = "; ".join(
+            _change_text(name, trend, covered_h) for name, trend, _ in significant_trends
+        )
         return [
-            f"Change with time over {covered_h:.3g} h (straight lines, 95 %): {slopes_text}. "
-            "Pooled values are means over this time."
+            f"Change with time over {format_hours(covered_h)} (straight lines, 95 %): "
+            f"{changes_text}. Pooled values are means over this time."
         ]
     lowest_p_value = min(trend.p_value for _, trend, _ in trends)
     return [
-        f"No significant change with time over {covered_h:.3g} h (straight lines, lowest p of "
-        f"{len(trends)}: {format_p_value(lowest_p_value)}): {_slope_text(*trends[0][:2])}."
+        f"No significant change with time over {format_hours(covered_h)} (straight lines, lowest "
+        f"p of {len(trends)}: {format_p_value(lowest_p_value)}): "
+        f"{_change_text(*trends[0][:2], covered_h)}."
     ]
 
 
-def _slope_text(quantity: str, trend: Trend) -> str:
-    """Describe the change of a quantity per hour, with its 95 % interval as a half width."""
+def _change_text(quantity: str, trend: Trend, covered_h: float) -> str:
+    """Describe the change of a quantity over a time in hours, with its 95 % half width.
+
+    The change is per hour if the time is `_MIN_RATE_DURATION_H` or more.
+    """
     quantity_label, factor, display_unit = label_and_unit(quantity)
-    half_width = (trend.interval_95_per_h[1] - trend.interval_95_per_h[0]) / 2
-    slope_text, half_width_text = rounded_to_uncertainty(
-        (trend.slope_per_h, half_width), half_width, factor
+    is_rate = covered_h >= _MIN_RATE_DURATION_H
+    change_h = 1.0 if is_rate else covered_h
+    half_width = change_h * (trend.interval_95_per_h[1] - trend.interval_95_per_h[0]) / 2
+    change_text, half_width_text = rounded_to_uncertainty(
+        (change_h * trend.slope_per_h, half_width), half_width, factor
     )
     sign_text = "+" if trend.slope_per_h > 0 else ""
     unit_text = f" {display_unit}" if display_unit else ""
-    return f"{quantity_label} by {sign_text}{slope_text} ± {half_width_text}{unit_text} per hour"
+    rate_text = " per hour" if is_rate else ""
+    return f"{quantity_label} by {sign_text}{change_text} ± {half_width_text}{unit_text}{rate_text}"
 
 
 def pooled_title(title_text: str, homogeneity: Homogeneity) -> str:

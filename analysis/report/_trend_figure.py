@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.labels import format_p_value, label_and_unit, symbol_with_unit
+from analysis.campaigns.labels import format_hours, format_p_value, label_and_unit, symbol_with_unit
 from analysis.report import _style as style
 from analysis.statistics import NORMAL_95
 
@@ -37,14 +37,14 @@ def trend_figure(campaign: CampaignResult) -> Figure:
         for session in campaign.sessions
         if session.experiment.middle_utc_s is not None
     }
+    covered_h = (max(times_s.values()) - min(times_s.values())) / 3600
     row_count = -(-len(scatters) // _PANELS_PER_ROW)
     width_in, height_in = 13.0, _PANEL_HEIGHT_IN * row_count + 1.35
     kind_text = "blocks" if campaign.homogeneity.is_one_session else "sessions"
     figure = style.new_figure(
         width_in,
         height_in,
-        f"Change with time over {(max(times_s.values()) - min(times_s.values())) / 3600:.3g} h, "
-        f"{len(times_s)} {kind_text}",
+        f"Change with time over {format_hours(covered_h)}, {len(times_s)} {kind_text}",
         f"each fitted by itself  ·  parameters: type {campaign.homogeneity.structure}  ·  "
         "p: p-value of no change",
     )

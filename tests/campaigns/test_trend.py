@@ -3,10 +3,12 @@
 import csv
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from analysis.campaigns.specimen_sentences import describe_trends
 from analysis.campaigns.trend import linear_trend
 from analysis.record import RecordError
 from analysis.record_part import RecordSource, blocks_of_session
@@ -159,7 +161,7 @@ def test_change_is_stated_of_the_blocks(analyze_here, loosening, tmp_path):
     assert result.returncode == 0, result.stderr
     assert "in blocks of 40 s" in result.stderr
     assert "The antenna did not stay in one state during the session" in result.stdout
-    assert "Change with time over 0.0444 h" in result.stdout
+    assert "Change with time over 2.67 min" in result.stdout
     assert (tmp_path / "r" / "figures" / "trends.svg").exists()
     assert "5 blocks of a session" in (tmp_path / "r" / "report.html").read_text("utf-8")
     with (tmp_path / "r" / "tables" / "homogeneity.csv").open(encoding="utf-8") as file:
@@ -176,6 +178,21 @@ def test_change_is_stated_of_the_blocks(analyze_here, loosening, tmp_path):
     assert [(one["from_s"], one["to_s"]) for one in content["files"]] == [
         (None, 40.0), (40.0, 80.0), (80.0, 120.0), (120.0, 160.0), (160.0, None),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("step_s", "words"),
+    [
+        (40.0, "over 2 min (straight lines, 95 %): frequency of mode 2 by +0.0300 ± 0.0019 Hz. "),
+        (1200.0, "over 1 h (straight lines, 95 %): frequency of mode 2 by +0.0300 ± 0.0019 Hz per"),
+    ],
+)
+def test_change_in_less_than_an_hour_is_not_stated_per_hour(step_s, words):
+    times_s = [step_s * block for block in range(4)]
+    trend = linear_trend(times_s, [16.0, 16.01, 16.02, 16.03], [3.3e-4] * 4)
+    scatter = SimpleNamespace(quantity="frequency_hz_2", trend=trend, has_significant_trend=True)
+    (sentence,) = describe_trends(SimpleNamespace(quantities=(scatter,), is_one_session=False))
+    assert words in sentence
 
 
 @pytest.mark.fit
