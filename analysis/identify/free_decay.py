@@ -222,7 +222,13 @@ class LaterDecaySpectra(DecaySpectra):
         poles: Sequence[Pole],
         amplitudes: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the torque in N·m of decays with given amplitudes; 0 before they begin, (n,)."""
+        """Return the torque in N·m of decays with given amplitudes; 0 before they begin, (n,).
+
+        Parameters
+        ----------
+        time_s, poles, amplitudes
+            As for `DecaySpectra`.
+        """
         elapsed_s = time_s - self._start_s
         has_begun = elapsed_s >= 0
         torque_nm = np.zeros(time_s.size)

@@ -410,6 +410,7 @@ def headline_of_fit(
     acts_as_stiffness_or_mass = any(
         not lowest_order < fit.parameters[order_name] < highest_order
         for order_name in order_reasons
+        if fit.structure.has_damping_of(order_name)
     )
     if (
         damping_reason
