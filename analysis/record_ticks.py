@@ -6,7 +6,7 @@ The grid needs no signals, so that a long record can be checked before its signa
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -291,6 +291,10 @@ def _describe_faults(
 
 # Signals
 
+_COUNTED_LEVELS: Final = 3
+"""Number of different values, the outermost of a torque, that are counted: the extreme, and two
+with which clipping is distinguished from a coarse resolution."""
+
 
 @dataclass(frozen=True, slots=True)
 class TorqueExtreme:
@@ -304,11 +308,15 @@ class TorqueExtreme:
         Number of samples with exactly this torque.
     repeated_count : int
         Number of these samples whose neighbour also has this torque.
+    inner_counts : tuple of int
+        Numbers of samples with exactly the next torque further inside, and with the one after it;
+        0 if there is no such torque.
     """
 
     limit_nm: float
     sample_count: int
     repeated_count: int
+    inner_counts: tuple[int, int]
 
 
 class ExtremeCount:
@@ -324,29 +332,50 @@ class ExtremeCount:
 
     def __init__(self, sign_of_extreme: int) -> None:
         self._sign = sign_of_extreme
-        self._limit_nm = -np.inf
-        self._values = self._repeated = 0
+        self._counts_by_level: dict[float, int] = {}  # levels in descending order
+        self._repeated = 0
         self._last_nm = np.full(2, np.nan)
 
     def add(self, torque_nm: NDArray[np.float64]) -> None:
         """Include the next values."""
         signed_torque_nm = np.concatenate([self._last_nm, self._sign * torque_nm])
-        largest_torque_nm = float(
-            np.max(signed_torque_nm[2:], initial=-np.inf, where=~np.isnan(signed_torque_nm[2:]))
-        )
-        if largest_torque_nm > self._limit_nm:
-            self._limit_nm, self._values, self._repeated = largest_torque_nm, 0, 0
-        is_at_limit = signed_torque_nm == self._limit_nm
+        new_torque_nm = signed_torque_nm[2:]
+        self._last_nm = signed_torque_nm[-2:]
+        is_known = ~np.isnan(new_torque_nm)
+        if not is_known.any():
+            return
+        former_limit_nm = next(iter(self._counts_by_level), -np.inf)
+        self._count_levels(new_torque_nm[is_known])
+        limit_nm = next(iter(self._counts_by_level))
+        if limit_nm > former_limit_nm:
+            self._repeated = 0
+        is_at_limit = signed_torque_nm == limit_nm
         follows_limit_sample = is_at_limit[2:] & is_at_limit[1:-1]
-        self._values += int(np.count_nonzero(is_at_limit[2:]))
         # The first of a run of such values counts when the second arrives.
         self._repeated += int(np.count_nonzero(follows_limit_sample))
         self._repeated += int(np.count_nonzero(follows_limit_sample & ~is_at_limit[:-2]))
-        self._last_nm = signed_torque_nm[-2:]
+
+    def _count_levels(self, torque_nm: NDArray[np.float64]) -> None:
+        """Add the numbers of known values at the outermost levels."""
+        counts_by_level = dict(self._counts_by_level)
+        upper_end_nm = np.inf
+        for _ in range(_COUNTED_LEVELS):
+            level_nm = float(np.max(torque_nm, initial=-np.inf, where=torque_nm < upper_end_nm))
+            if level_nm == -np.inf:
+                break
+            value_count = int(np.count_nonzero(torque_nm == level_nm))
+            counts_by_level[level_nm] = counts_by_level.get(level_nm, 0) + value_count
+            upper_end_nm = level_nm
+        levels_nm = sorted(counts_by_level, reverse=True)[:_COUNTED_LEVELS]
+        self._counts_by_level = {level_nm: counts_by_level[level_nm] for level_nm in levels_nm}
 
     def torque_extreme(self) -> TorqueExtreme:
         """Return the extreme of all values."""
-        return TorqueExtreme(self._sign * self._limit_nm, self._values, self._repeated)
+        limit_nm = next(iter(self._counts_by_level), -np.inf)
+        limit_count, *inner_counts = (*self._counts_by_level.values(), 0, 0, 0)[:_COUNTED_LEVELS]
+        return TorqueExtreme(
+            self._sign * limit_nm, limit_count, self._repeated, (inner_counts[0], inner_counts[1])
+        )
 
 
 def torque_extremes(torque_nm: NDArray[np.float64]) -> tuple[TorqueExtreme, ...]:

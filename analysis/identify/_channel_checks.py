@@ -33,6 +33,11 @@ _MIN_CLIPPED_VALUES: Final = 4
 """Minimum number of samples at the extreme of the torque, each next to another one, that is
 reported as clipping. Noise does not repeat its largest value."""
 
+_MIN_CLIPPED_TO_INNER_RATIO: Final = 3.0
+"""Minimum ratio of the number of samples at the extreme of a clipped torque to that at each of the
+next two torques inside. For a coarse resolution alone it is at most 2.4, as in the crests of a sine
+(1 / (sqrt(2) - 1)), and less than 1 for noise."""
+
 _STANDSTILL_BLOCK_S: Final = 0.5
 """Duration in seconds of the blocks in which a standstill of the motor is searched for."""
 
@@ -41,12 +46,18 @@ _MAX_STANDSTILL_MOTION_RATIO: Final = 0.02
 
 
 def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
-    """Yield a finding if the torque is clipped: several values lie exactly at its extremes."""
+    """Yield a finding if the torque is clipped: many values lie exactly at its extremes.
+
+    If the resolution of the torque is coarse, values at the extremes coincide, too. There are then
+    as many or more at the next values inside.
+    """
     known_torque_nm = np.where(measurement.torque_known, measurement.torque_nm, np.nan)
     clipped_extremes = [
         extreme
         for extreme in measurement.torque_extremes or torque_extremes(known_torque_nm)
-        if extreme.limit_nm != 0 and extreme.repeated_count >= _MIN_CLIPPED_VALUES
+        if extreme.limit_nm != 0
+        and extreme.repeated_count >= _MIN_CLIPPED_VALUES
+        and extreme.sample_count >= _MIN_CLIPPED_TO_INNER_RATIO * max(extreme.inner_counts)
     ]
     if not clipped_extremes:
         return

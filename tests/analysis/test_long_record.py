@@ -155,6 +155,10 @@ def test_clipping_is_found_in_all_samples(
     neighbours = np.roll(at_limit, 1) | np.roll(at_limit, -1)
     assert smallest.repeated_count == np.count_nonzero(at_limit & neighbours) >= 4
     assert (largest.limit_nm, largest.sample_count) == (torque_nm.max(), 1)
+    levels_nm, counts = np.unique(torque_nm, return_counts=True)
+    assert smallest.inner_counts == tuple(counts[1:3])
+    assert largest.inner_counts == tuple(counts[-2:-4:-1])
+    assert levels_nm[0] == smallest.limit_nm
     assert decimated.torque_extremes[1].sample_count == 1
     assert load_record(paper_file).torque_extremes == ()
     measurement = Measurement.from_record(load_record(path, longest_samples=LONGEST))

@@ -252,6 +252,33 @@ def test_a_torque_flat_at_its_extremes_is_clipped():
     assert not any(clipping_findings(replace(made, torque_nm=coarse)))
 
 
+@pytest.mark.parametrize("step_nm", [5e-3, 2e-2])
+def test_coarse_torque_is_clipped_only_if_its_extremes_are_more_frequent_than_others(step_nm):
+    made = record()
+    coarse_nm = np.round(made.torque_nm / step_nm) * step_nm
+    # The step at the extreme of a resonance contains several successive values.
+    largest_nm = coarse_nm.max()
+    coarse_nm[np.flatnonzero(coarse_nm == largest_nm)[0] + np.arange(4)] = largest_nm
+    assert not any(clipping_findings(replace(made, torque_nm=coarse_nm)))
+    limit_nm = 0.8 * largest_nm
+    for clipped_nm in (
+        np.clip(coarse_nm, -limit_nm, limit_nm),
+        np.round(np.clip(made.torque_nm, -limit_nm, limit_nm) / step_nm) * step_nm,
+    ):
+        (finding,) = clipping_findings(replace(made, torque_nm=clipped_nm))
+        assert finding.value == pytest.approx(limit_nm, abs=step_nm)
+
+
+@pytest.mark.parametrize("noise_nm", [0.0, 1e-3])
+def test_steps_at_the_crests_of_a_sine_are_no_clipping(noise_nm):
+    """The resolution of 20 mN·m just ends at the crest, where most values are in one step."""
+    t, step_nm = np.arange(TICKS) / RATE_HZ, 0.02
+    noise_nm = np.random.default_rng(1).normal(scale=noise_nm, size=TICKS)
+    torque_nm = 14.49 * step_nm * np.sin(2 * np.pi * 1.7 * t) + noise_nm
+    coarse_nm = np.round(torque_nm / step_nm) * step_nm
+    assert not any(clipping_findings(replace(record(), torque_nm=coarse_nm)))
+
+
 def test_motor_standstill_despite_reference():
     made = record()
     stopped = made.angle_rad.copy()
