@@ -382,6 +382,10 @@ _MAX_PLAUSIBLE_TORQUE_RATIO: Final = 3.0
 """Largest ratio of measured to modelled torque that damping and a wrong mass may explain. Units
 that are easily confused differ by a factor of more than ten."""
 
+_MAX_TOOL_TO_BEAM_INERTIA: Final = 5.0
+"""Largest tool inertia that the profile may have left out, relative to the moment of inertia of the
+beam."""
+
 
 def torque_anomaly(
     angle_rad: NDArray[np.float64],
@@ -390,6 +394,9 @@ def torque_anomaly(
     specimen: SpecimenFile,
 ) -> str | None:
     """Check sign and size of the torque against the undamped beam near its first resonance.
+
+    Above the resonance, the torque of a tool is opposite to that of the beam. If a tool inertia
+    that is not stated explains the torque better, sign and size are those of the beam's part.
 
     `angle_rad` and `torque_nm` are the whole record, all values finite. Return a sentence with
     anomaly and remedy, or None if the torque is plausible or the motion too small for the check.
@@ -411,9 +418,15 @@ def torque_anomaly(
             np.fft.rfft(taper * (channel_values - channel_values.mean()))[in_band]
             for channel_values in (angle_rad, torque_nm)
         )
+        inertia_spectrum = s**2 * angle_spectrum
         model_spectrum = (
-            transfer(s, specimen.beam, Damping()) + specimen.tool_inertia_kg_m2 * s**2
-        ) * angle_spectrum
+            transfer(s, specimen.beam, Damping()) * angle_spectrum
+            + specimen.tool_inertia_kg_m2 * inertia_spectrum
+        )
+        beam_inertia_kg_m2 = specimen.beam.density_kg_per_m * specimen.beam.length_m**3 / 3
+        model_spectrum = _add_unstated_tool(
+            model_spectrum, beam_inertia_kg_m2 * inertia_spectrum, torque_spectrum
+        )
         model_power, torque_power = (
             float(np.vdot(spectrum, spectrum).real)
             for spectrum in (model_spectrum, torque_spectrum)
@@ -437,6 +450,39 @@ def torque_anomaly(
             "the reaction with --reverse-torque."
         )
     return None
+
+
+def _add_unstated_tool(
+    model_spectrum: NDArray[np.complex128],
+    rigid_spectrum: NDArray[np.complex128],
+    torque_spectrum: NDArray[np.complex128],
+) -> NDArray[np.complex128]:
+    """Return the modelled torque, with a tool inertia that is not stated if this fits much better.
+
+    All arrays have shape (k,): modelled torque, torque of a rigid body with the moment of inertia
+    of the beam, and measured torque.
+    """
+    columns = np.stack([model_spectrum, rigid_spectrum], axis=1)
+    column_parts, torque_parts = (
+        np.concatenate([spectrum.real, spectrum.imag]) for spectrum in (columns, torque_spectrum)
+    )
+    if not (np.isfinite(column_parts).all() and np.isfinite(torque_parts).all()):
+        return model_spectrum
+    misfits, fitted_gains = [], []
+    for column_count in (1, 2):
+        used_columns = column_parts[:, :column_count]
+        gains = np.linalg.lstsq(used_columns, torque_parts)[0]
+        misfits.append(float(np.linalg.norm(torque_parts - used_columns @ gains)))
+        fitted_gains.append(gains)
+    beam_gain, rigid_gain = map(float, fitted_gains[1])
+    is_tool_inertia = (
+        rigid_gain * beam_gain > 0
+        and abs(rigid_gain) < _MAX_TOOL_TO_BEAM_INERTIA * abs(beam_gain)
+        and misfits[1] < misfits[0] / 2
+    )
+    if not is_tool_inertia:
+        return model_spectrum
+    return model_spectrum + rigid_gain / beam_gain * rigid_spectrum
 
 
 # Session file

@@ -5,13 +5,18 @@ of the beam that the file states. The median of this ratio over the band depends
 exact mode frequencies nor on the damping. The magnitude of a noisy ratio is too large on average.
 It is therefore averaged over adjacent frequencies, and where the expected torque is small it has a
 smaller weight. Resonances have no larger weight than others: their frequencies may differ.
+
+The torque of a tool inertia (between sensor and beam) that the file does not state is opposite to
+that of the beam above each resonance, and larger at high frequencies. If the response of the beam
+alone does not explain the torque, sign and unit are therefore those of the part of the beam, with
+the tool inertia that explains the torque best.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 
@@ -22,6 +27,8 @@ from rigd.beam import Damping, ResponseGrid
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._data import Measurement
@@ -156,6 +163,197 @@ _CERTAIN_LOG_UNIT_FACTOR: Final = math.log(5.0)
 searches for a stiffness so far from that of the file."""
 
 
+_MAX_TOOL_TO_BEAM_INERTIA: Final = 5.0
+"""Largest tool inertia that is searched for, relative to the moment of inertia of the beam."""
+
+_MIN_TOOL_TO_BEAM_INERTIA: Final = 1e-3
+"""Smallest tool inertia other than 0 that is searched for, relative to that of the beam."""
+
+_LOG_INERTIA_STEP: Final = 0.05
+"""Largest step of the search for the tool inertia, as a difference of logarithms."""
+
+_PLAUSIBLE_GAINS: Final = (0.5, 0.7, 1.0, 1.4, 2.0)
+"""Ratios of the beam's torque to that of the file that need no wrong unit, for the search."""
+
+_MAX_RELATIVE_MISFIT: Final = 1.4
+"""Largest ratio of the misfits of two explanations that fit equally well."""
+
+_EQUAL_MISFIT_DIFFERENCE: Final = 0.05
+"""Difference of misfits that is allowed in addition, for differences from the assumed damping."""
+
+_MAX_CERTAIN_MISFIT: Final = 0.1
+"""Largest misfit with a tool inertia that the file does not state at which sign or unit are wrong
+with certainty. With a larger one, the torque may be that of another beam."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Explanation:
+    """Gain of the beam's torque for an assumed tool inertia, and how well it fits.
+
+    Attributes
+    ----------
+    misfit : float
+        Mean relative difference of the torque, from 0 to 2.
+    gain : float
+        Ratio of the measured torque to the expected one, negative for a wrong sign.
+    phase_cosine : float
+        Median cosine of the phase between measured and expected torque.
+    """
+
+    misfit: float
+    gain: float
+    phase_cosine: float
+
+    def fits_as_well_as(self, other: _Explanation) -> bool:
+        """Return whether the misfit is hardly larger than that of another explanation."""
+        return self.misfit <= _MAX_RELATIVE_MISFIT * other.misfit + _EQUAL_MISFIT_DIFFERENCE
+
+
+@dataclass(frozen=True, slots=True)
+class _GroupedTorque:
+    """Products of the spectra of torque, beam torque and torque of 1 kg m², summed over groups.
+
+    Each group has adjacent frequencies, at which the motor moves. All arrays have shape (groups,).
+
+    Attributes
+    ----------
+    torque_by_beam, torque_by_inertia : ndarray of complex
+        Measured torque times the conjugate of the expected torque of the beam, or of the inertia.
+    beam_by_inertia : ndarray of complex
+        Expected torque of the beam times the conjugate of that of the inertia.
+    beam_power, inertia_power : ndarray
+        Powers of these expected torques.
+    weights : ndarray
+        Weights of the groups: the measured torque, at most its median.
+    """
+
+    torque_by_beam: NDArray[np.complex128]
+    torque_by_inertia: NDArray[np.complex128]
+    beam_by_inertia: NDArray[np.complex128]
+    beam_power: NDArray[np.float64]
+    inertia_power: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+    @classmethod
+    def from_comparison(cls, comparison: Comparison) -> Self:
+        """Return the products of a record, with the beam of its file."""
+        angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained_samples])
+        torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained_samples])
+        angle_power = np.abs(angle_spectrum) ** 2
+        is_driven_bin = angle_power > _MIN_DRIVEN_POWER_FRACTION * angle_power.max()
+        torque = torque_spectrum[is_driven_bin]
+        plant = replace(
+            comparison.measurement.nominal_plant,
+            damping=Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S),
+            tool_inertia_kg_m2=0.0,
+        )
+        beam_torque, inertia_torque = ResponseGrid(
+            2j * np.pi * comparison.frequency_hz[is_driven_bin]
+        ).evaluate(plant, ("tool_inertia_kg_m2",), angle_spectrum[is_driven_bin])
+        group_size = max(1, min(_MAX_GROUP_SIZE, torque.size // _MIN_GROUPS))
+        first_frequencies = np.arange(0, torque.size, group_size)
+        torque_rms = np.sqrt(np.add.reduceat(np.abs(torque) ** 2, first_frequencies))
+        return cls(
+            np.add.reduceat(torque * beam_torque.conj(), first_frequencies),
+            np.add.reduceat(torque * inertia_torque.conj(), first_frequencies),
+            np.add.reduceat(beam_torque * inertia_torque.conj(), first_frequencies),
+            np.add.reduceat(np.abs(beam_torque) ** 2, first_frequencies),
+            np.add.reduceat(np.abs(inertia_torque) ** 2, first_frequencies),
+            np.minimum(torque_rms, np.median(torque_rms)),
+        )
+
+    def explanations(
+        self, tool_inertia_kg_m2: float, gains: tuple[float, ...] = ()
+    ) -> tuple[_Explanation, ...]:
+        """Return the explanations with a tool inertia and some gains; by default with the median.
+
+        Parameters
+        ----------
+        tool_inertia_kg_m2 : float
+            Assumed tool inertia.
+        gains : tuple of float
+            Gains.
+        """
+        expected_power = (
+            self.beam_power
+            + 2 * tool_inertia_kg_m2 * self.beam_by_inertia.real
+            + tool_inertia_kg_m2**2 * self.inertia_power
+        )
+        torque_ratio = (
+            self.torque_by_beam + tool_inertia_kg_m2 * self.torque_by_inertia
+        ) / expected_power
+        ratio_magnitude = np.maximum(np.abs(torque_ratio), np.finfo(float).tiny)
+        phase_cosine = float(np.median(torque_ratio.real / ratio_magnitude))
+        if not gains:
+            expected_rms = np.sqrt(expected_power)
+            median_magnitude = np.quantile(
+                ratio_magnitude,
+                0.5,
+                method="inverted_cdf",
+                weights=np.minimum(expected_rms, np.median(expected_rms)),
+            )
+            gains = (math.copysign(float(median_magnitude), phase_cosine),)
+        return tuple(
+            _Explanation(
+                float(
+                    np.average(
+                        np.abs(torque_ratio - gain) / np.maximum(ratio_magnitude, abs(gain)),
+                        weights=self.weights,
+                    )
+                ),
+                gain,
+                phase_cosine,
+            )
+            for gain in gains
+        )
+
+
+def _likeliest_explanation(comparison: Comparison) -> _Explanation:
+    """Return the simplest explanation of the torque that fits about as well as any.
+
+    The first is the tool inertia of the file with any gain. The others have a tool inertia that the
+    file does not state: first with a plausible gain, then with such a gain of the wrong sign, then
+    with any gain.
+    """
+    torque, measurement = _GroupedTorque.from_comparison(comparison), comparison.measurement
+    stated_inertia_kg_m2, beam = measurement.tool_inertia_kg_m2, measurement.beam
+    [as_stated] = torque.explanations(stated_inertia_kg_m2)
+    beam_inertia_kg_m2 = beam.density_kg_per_m * beam.length_m**3 / 3
+    smallest_kg_m2, largest_kg_m2 = (
+        _MIN_TOOL_TO_BEAM_INERTIA * beam_inertia_kg_m2,
+        max(_MAX_TOOL_TO_BEAM_INERTIA * beam_inertia_kg_m2, 2 * stated_inertia_kg_m2),
+    )
+    step_count = math.ceil(math.log(largest_kg_m2 / smallest_kg_m2) / _LOG_INERTIA_STEP)
+    tool_inertias_kg_m2 = (
+        stated_inertia_kg_m2,
+        0.0,
+        *np.geomspace(smallest_kg_m2, largest_kg_m2, step_count + 1).tolist(),
+    )
+    with_any_gain, with_plausible_gain, with_wrong_sign = (
+        min(
+            (
+                explanation
+                for tool_inertia_kg_m2 in tool_inertias_kg_m2
+                for explanation in torque.explanations(tool_inertia_kg_m2, gains)
+            ),
+            key=lambda explanation: explanation.misfit,
+        )
+        for gains in ((), _PLAUSIBLE_GAINS, tuple(-gain for gain in _PLAUSIBLE_GAINS))
+    )
+    if as_stated.fits_as_well_as(with_any_gain):
+        return as_stated
+    if (
+        with_plausible_gain.fits_as_well_as(with_any_gain)
+        and _MAX_RELATIVE_MISFIT * with_plausible_gain.misfit < as_stated.misfit
+    ):
+        return replace(with_plausible_gain, gain=1.0, phase_cosine=1.0)
+    if with_any_gain.misfit > _MAX_CERTAIN_MISFIT:
+        return as_stated
+    if with_wrong_sign.fits_as_well_as(with_any_gain):
+        return replace(with_wrong_sign, gain=-1.0, phase_cosine=-1.0)
+    return with_any_gain
+
+
 def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     """Yield a finding if the ratio of torque to motor angle has a wrong sign or a wrong unit.
 
@@ -170,31 +368,10 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     compared_fraction = squared_steps[first_sample:].sum() / squared_steps.sum()
     if compared_fraction < _MIN_COMPARED_MOTION_FRACTION:
         return
-    angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained_samples])
-    torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained_samples])
-    angle_power = np.abs(angle_spectrum) ** 2
-    is_driven_bin = angle_power > _MIN_DRIVEN_POWER_FRACTION * angle_power.max()
-    plant = replace(
-        comparison.measurement.nominal_plant, damping=Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S)
-    )
-    [expected_response] = ResponseGrid(
-        2j * np.pi * comparison.frequency_hz[is_driven_bin]
-    ).evaluate(plant)
-    expected_torque = angle_spectrum[is_driven_bin] * expected_response
-    group_size = max(1, min(_MAX_GROUP_SIZE, expected_torque.size // _MIN_GROUPS))
-    first_frequencies = np.arange(0, expected_torque.size, group_size)
-    expected_power = np.add.reduceat(np.abs(expected_torque) ** 2, first_frequencies)
-    torque_ratio = (
-        np.add.reduceat(torque_spectrum[is_driven_bin] * expected_torque.conj(), first_frequencies)
-        / expected_power
-    )
-    ratio_magnitude = np.abs(torque_ratio)
-    phase_cosine = float(
-        np.median(torque_ratio.real / np.maximum(ratio_magnitude, np.finfo(float).tiny))
-    )
-    if abs(phase_cosine) < _MIN_PHASE_COSINE:
+    explanation = _likeliest_explanation(comparison)
+    if abs(explanation.phase_cosine) < _MIN_PHASE_COSINE:
         return
-    if phase_cosine < 0:
+    if explanation.phase_cosine < 0:
         yield Finding(
             kind="sign",
             sentence=(
@@ -206,15 +383,7 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
                 "the beam towards positive angles."
             ),
         )
-    expected_rms = np.sqrt(expected_power)
-    median_magnitude = float(
-        np.quantile(
-            ratio_magnitude,
-            0.5,
-            method="inverted_cdf",
-            weights=np.minimum(expected_rms, np.median(expected_rms)),
-        )
-    )
+    median_magnitude = abs(explanation.gain)
     if not median_magnitude > 0 or abs(math.log(median_magnitude)) < _MIN_LOG_UNIT_FACTOR:
         return
     log_differences = {
@@ -228,7 +397,7 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     ]
     if not matching_units and abs(math.log(median_magnitude)) < _CERTAIN_LOG_UNIT_FACTOR:
         return
-    explanation = (
+    unit_text = (
         f"which is the factor of {' or of '.join(matching_units)}: a wrong unit"
         if matching_units
         else "more than a beam may deviate from its data: a wrong unit or gain, or another beam"
@@ -237,7 +406,7 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
         kind="unit",
         sentence=(
             f"Torque over angle is {median_magnitude:.3g} times what the beam in the file gives, "
-            f"{explanation}. No number here is valid for the antenna."
+            f"{unit_text}. No number here is valid for the antenna."
         ),
         value=median_magnitude,
         remedy="Check the units of angle and torque, and import the record again.",

@@ -306,6 +306,22 @@ def test_wrong_units_and_sign_are_found_by_the_beam(
     assert [event.message for event in read_session(done.path).events] == list(done.warnings)
 
 
+@pytest.mark.parametrize("tool_inertia_kg_m2", [further(3e-4), 1e-3, further(4e-3)])
+def test_tool_inertia_that_is_not_stated_is_no_wrong_sign(
+    csv_of, make_plan, tmp_path, motion, tool_inertia_kg_m2
+):
+    angle_rad, torque_nm = motion
+    acceleration = np.gradient(np.gradient(angle_rad, 1e-3), 1e-3)
+    torque_nm = torque_nm + tool_inertia_kg_m2 * acceleration
+    source = csv_of(angle=angle_rad, torque=torque_nm)
+    done = import_record(source, tmp_path / "a.mcap", make_plan())
+    assert done.warnings == ()
+    done = import_record(source, tmp_path / "b.mcap", make_plan(angle="angle:deg"))
+    assert "check the units" in done.warnings[0]
+    done = import_record(source, tmp_path / "c.mcap", make_plan(reverse_torque=True))
+    assert "opposite sign" in done.warnings[0]
+
+
 def test_a_reaction_is_reversed(csv_of, make_plan, tmp_path, motion):
     source = csv_of(angle=motion[0], torque=-motion[1])
     done = import_record(source, tmp_path / "a.mcap", make_plan(reverse_torque=True))

@@ -175,21 +175,43 @@ def test_other_frequencies_are_no_wrong_unit(ends):
     assert list(sign_and_unit_findings(comparison)) == []
 
 
-def test_stated_tool_inertia_belongs_to_the_expected_torque():
-    """It exceeds the torque of the beam at most frequencies, with the opposite sign."""
-    beam_alone, tool_inertia_kg_m2 = record(), 5e-4
-    acceleration = np.gradient(np.gradient(beam_alone.angle_rad, 1 / RATE_HZ), 1 / RATE_HZ)
+def with_tool(factor, tool_inertia_kg_m2, stated_kg_m2=0.0, noise_nm=3e-3):
+    """Return the comparison of a record whose torque has that of a tool, times a factor."""
+    beam_alone = record(noise_nm=noise_nm)
+    # The motor is at rest at the beginning and at the end.
+    omega_rad_s = 2 * np.pi * np.fft.rfftfreq(TICKS, 1 / RATE_HZ)
+    acceleration = np.fft.irfft(-(omega_rad_s**2) * np.fft.rfft(beam_alone.angle_rad), TICKS)
     measurement = replace(
         beam_alone,
-        torque_nm=beam_alone.torque_nm + tool_inertia_kg_m2 * acceleration,
-        tool_inertia_kg_m2=tool_inertia_kg_m2,
+        torque_nm=factor * (beam_alone.torque_nm + tool_inertia_kg_m2 * acceleration),
+        tool_inertia_kg_m2=stated_kg_m2,
     )
-    comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
+    return Comparison.from_measurement(measurement, (0.0, 50.0))
+
+
+@pytest.mark.parametrize("tool_inertia_kg_m2", [1e-4, 2e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize("stated_fraction", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("noise_nm", [3e-3, further(3e-2)])
+def test_tool_inertia_is_no_wrong_sign_and_no_wrong_unit(
+    tool_inertia_kg_m2, stated_fraction, noise_nm
+):
+    """Its torque exceeds that of the beam at most frequencies, and is opposite to it."""
+    comparison = with_tool(1.0, tool_inertia_kg_m2, stated_fraction * tool_inertia_kg_m2, noise_nm)
     assert list(sign_and_unit_findings(comparison)) == []
-    unstated = Comparison.from_measurement(
-        replace(measurement, tool_inertia_kg_m2=0.0), (0.0, 50.0)
-    )
-    assert list(sign_and_unit_findings(unstated)) != []
+
+
+@pytest.mark.parametrize(
+    ("factor", "kinds"),
+    [(-1.0, ["sign"]), (180 / np.pi, ["unit"]), (np.pi / 180, ["unit"]), (-1e-3, ["sign", "unit"])],
+)
+@pytest.mark.parametrize("stated_fraction", [0.0, 1.0])
+def test_wrong_sign_and_unit_are_found_with_a_tool_inertia(factor, kinds, stated_fraction):
+    for tool_inertia_kg_m2 in (2e-4, 1e-3):
+        comparison = with_tool(factor, tool_inertia_kg_m2, stated_fraction * tool_inertia_kg_m2)
+        found = list(sign_and_unit_findings(comparison))
+        assert [finding.kind for finding in found] == kinds
+        if "unit" in kinds:
+            assert found[-1].value == pytest.approx(abs(factor), rel=0.05)
 
 
 def test_unit_of_a_short_record_is_not_that_of_its_resonances():
