@@ -115,8 +115,11 @@ class ModesWithDrag:
 
     @property
     def is_significant(self) -> bool:
-        """Return whether C_D d exceeds 0 by more than chance explains."""
-        return self.law.constant_m > SIGNIFICANT_STD * self.drag_std_m
+        """Return whether C_D d is that of a beam, and exceeds 0 by more than chance explains.
+
+        A damping that changes along the record resembles a smaller drag.
+        """
+        return self.law.constant_m > max(_SMALLEST_DRAG_M, SIGNIFICANT_STD * self.drag_std_m)
 
     def finding(self) -> Finding:
         """Return the finding that the damping ratios are those without air, and less certain.
