@@ -423,9 +423,8 @@ def torque_anomaly(
             transfer(s, specimen.beam, Damping()) * angle_spectrum
             + specimen.tool_inertia_kg_m2 * inertia_spectrum
         )
-        beam_inertia_kg_m2 = specimen.beam.density_kg_per_m * specimen.beam.length_m**3 / 3
         model_spectrum = _add_unstated_tool(
-            model_spectrum, beam_inertia_kg_m2 * inertia_spectrum, torque_spectrum
+            model_spectrum, specimen.beam.inertia_kg_m2 * inertia_spectrum, torque_spectrum
         )
         model_power, torque_power = (
             float(np.vdot(spectrum, spectrum).real)

@@ -26,7 +26,7 @@ from analysis.record_ticks import torque_extremes
 from rigd.beam import Damping, ResponseGrid
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -266,16 +266,17 @@ class _GroupedTorque:
         )
 
     def explanations(
-        self, tool_inertia_kg_m2: float, gains: tuple[float, ...] = ()
-    ) -> tuple[_Explanation, ...]:
-        """Return the explanations with a tool inertia and some gains; by default with the median.
+        self, tool_inertia_kg_m2: float
+    ) -> tuple[_Explanation, _Explanation, _Explanation]:
+        """Return the best explanations with a tool inertia.
+
+        The first has any gain, which is the median, the second one of `_PLAUSIBLE_GAINS`, and the
+        third one of these of the wrong sign.
 
         Parameters
         ----------
         tool_inertia_kg_m2 : float
             Assumed tool inertia.
-        gains : tuple of float
-            Gains.
         """
         expected_power = (
             self.beam_power
@@ -287,28 +288,38 @@ class _GroupedTorque:
         ) / expected_power
         ratio_magnitude = np.maximum(np.abs(torque_ratio), np.finfo(float).tiny)
         phase_cosine = float(np.median(torque_ratio.real / ratio_magnitude))
-        if not gains:
-            expected_rms = np.sqrt(expected_power)
-            median_magnitude = np.quantile(
-                ratio_magnitude,
-                0.5,
-                method="inverted_cdf",
-                weights=np.minimum(expected_rms, np.median(expected_rms)),
-            )
-            gains = (math.copysign(float(median_magnitude), phase_cosine),)
-        return tuple(
-            _Explanation(
-                float(
-                    np.average(
-                        np.abs(torque_ratio - gain) / np.maximum(ratio_magnitude, abs(gain)),
-                        weights=self.weights,
-                    )
-                ),
-                gain,
-                phase_cosine,
-            )
-            for gain in gains
+        expected_rms = np.sqrt(expected_power)
+        median_magnitude = np.quantile(
+            ratio_magnitude,
+            0.5,
+            method="inverted_cdf",
+            weights=np.minimum(expected_rms, np.median(expected_rms)),
         )
+
+        median_gain = math.copysign(float(median_magnitude), phase_cosine)
+        gains = np.array([median_gain, *_PLAUSIBLE_GAINS, *(-gain for gain in _PLAUSIBLE_GAINS)])
+        differences = np.abs(torque_ratio - gains[:, None]) / np.maximum(
+            ratio_magnitude, np.abs(gains[:, None])
+        )
+        explanations = [
+            _Explanation(misfit, gain, phase_cosine)
+            for misfit, gain in zip(
+                np.average(differences, axis=1, weights=self.weights).tolist(),
+                gains.tolist(),
+                strict=True,
+            )
+        ]
+        gain_count = len(_PLAUSIBLE_GAINS)
+        return (
+            explanations[0],
+            _best(explanations[1 : 1 + gain_count]),
+            _best(explanations[1 + gain_count :]),
+        )
+
+
+def _best(explanations: Iterable[_Explanation]) -> _Explanation:
+    """Return the explanation with the smallest misfit."""
+    return min(explanations, key=lambda explanation: explanation.misfit)
 
 
 def _likeliest_explanation(comparison: Comparison) -> _Explanation:
@@ -320,13 +331,13 @@ def _likeliest_explanation(comparison: Comparison) -> _Explanation:
     """
     torque, measurement = _GroupedTorque.from_comparison(comparison), comparison.measurement
     stated_inertia_kg_m2, beam = measurement.tool_inertia_kg_m2, measurement.beam
-    [as_stated] = torque.explanations(stated_inertia_kg_m2)
+    as_stated, _, _ = torque.explanations(stated_inertia_kg_m2)
     if (
         as_stated.phase_cosine > _CERTAIN_PHASE_COSINE
         and abs(math.log(as_stated.gain)) < _MIN_LOG_UNIT_FACTOR
     ):
         return as_stated  # saves the search, which takes 40 ms
-    beam_inertia_kg_m2 = beam.density_kg_per_m * beam.length_m**3 / 3
+    beam_inertia_kg_m2 = beam.inertia_kg_m2
     smallest_kg_m2, largest_kg_m2 = (
         _MIN_TOOL_TO_BEAM_INERTIA * beam_inertia_kg_m2,
         max(_MAX_TOOL_TO_BEAM_INERTIA * beam_inertia_kg_m2, 2 * stated_inertia_kg_m2),
@@ -337,17 +348,10 @@ def _likeliest_explanation(comparison: Comparison) -> _Explanation:
         0.0,
         *np.geomspace(smallest_kg_m2, largest_kg_m2, step_count + 1).tolist(),
     )
-    with_any_gain, with_plausible_gain, with_wrong_sign = (
-        min(
-            (
-                explanation
-                for tool_inertia_kg_m2 in tool_inertias_kg_m2
-                for explanation in torque.explanations(tool_inertia_kg_m2, gains)
-            ),
-            key=lambda explanation: explanation.misfit,
-        )
-        for gains in ((), _PLAUSIBLE_GAINS, tuple(-gain for gain in _PLAUSIBLE_GAINS))
-    )
+    explanations = [torque.explanations(inertia_kg_m2) for inertia_kg_m2 in tool_inertias_kg_m2]
+    with_any_gain = _best(with_median for with_median, _, _ in explanations)
+    with_plausible_gain = _best(plausible for _, plausible, _ in explanations)
+    with_wrong_sign = _best(reversed_sign for _, _, reversed_sign in explanations)
     if as_stated.fits_as_well_as(with_any_gain):
         return as_stated
     if (

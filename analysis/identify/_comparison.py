@@ -24,7 +24,7 @@ from analysis.optimizer import RecentValues
 from rigd.beam import Plant, ResponseGrid, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -161,13 +161,10 @@ class Comparison:
         measurement.check_channels(highest_hz)
         # The rest before a step shows whether the beam was ringing: the filter may take a part of
         # it only.
-        rest_s = measurement.sudden_motion_s()
-        decimation = (
-            Decimation.to_band(measurement.rate_hz, highest_hz)
-            if rest_s is None
-            else Decimation.with_half_length(
-                measurement.rate_hz, highest_hz, _MAX_FILTER_TO_REST_RATIO * rest_s
-            )
+        decimation = Decimation.with_half_length(
+            measurement.rate_hz,
+            highest_hz,
+            _MAX_FILTER_TO_REST_RATIO * measurement.sudden_motion_s(),
         )
         angle_rad = decimation.apply(measurement.angle_from_rest_rad(highest_hz))
         usable_samples = decimation.samples_inside_record(measurement.angle_rad.size)
@@ -657,13 +654,23 @@ class Comparison:
         -------
         ndarray of complex, shape (k, K)
         """
-        total_gradient = self.decay_spectra.gradient(poles, amplitudes)
-        amplitudes_per_decay = count_decay_spectra(poles)
-        for decay_number, later_decay in enumerate(self.later_decay_spectra, start=1):
-            total_gradient += later_decay.gradient(
-                poles, amplitudes[decay_number * amplitudes_per_decay :]
-            )
+        (first_decays, first_amplitudes), *later_groups = self._decay_groups(poles, amplitudes)
+        total_gradient = first_decays.gradient(poles, first_amplitudes)
+        for later_decays, later_amplitudes in later_groups:
+            total_gradient += later_decays.gradient(poles, later_amplitudes)
         return total_gradient
+
+    def _decay_groups(
+        self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
+    ) -> Iterator[tuple[DecaySpectra, NDArray[np.float64]]]:
+        """Yield the decays from the beginning and from each long gap, with their amplitudes.
+
+        `amplitudes`, shape (m,), are those of the spectra that `nuisance_spectra` returns.
+        """
+        group_size = count_decay_spectra(poles)
+        for group_number, decays in enumerate((self.decay_spectra, *self.later_decay_spectra)):
+            first_amplitude = group_number * group_size
+            yield decays, amplitudes[first_amplitude : first_amplitude + group_size]
 
     def fill_unknown_torque(
         self,
@@ -690,14 +697,9 @@ class Comparison:
             return self
         unknown_ticks = np.flatnonzero(~is_torque_known)
         unknown_times_s = unknown_ticks / self.measurement.rate_hz - self.first_sample_s
-        amplitudes_per_decay = count_decay_spectra(poles)
         decay_torque_nm = np.zeros(unknown_ticks.size)
-        for decay_number, decay_spectra in enumerate(
-            (self.decay_spectra, *self.later_decay_spectra)
-        ):
-            decay_torque_nm += decay_spectra.torque_at(
-                unknown_times_s, poles, amplitudes[decay_number * amplitudes_per_decay :]
-            )
+        for decays, decay_amplitudes in self._decay_groups(poles, amplitudes):
+            decay_torque_nm += decays.torque_at(unknown_times_s, poles, decay_amplitudes)
         filled_torque_nm = self.measurement.torque_nm.copy()
         filled_torque_nm[unknown_ticks] = (
             self.removed_torque_in_gaps_nm

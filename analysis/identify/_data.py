@@ -8,6 +8,7 @@ record. Both channels are decimated to the band (`analysis.decimation`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -340,10 +341,10 @@ class Measurement:
             is_torque_known[first_tick:end_tick] = False
         return replace(self, torque_known=is_torque_known)
 
-    def sudden_motion_s(self) -> float | None:
+    def sudden_motion_s(self) -> float:
         """Return the time in seconds from the first tick at which the motor suddenly moves.
 
-        Return None if it moves from the first tick on, or slowly at first, as in a sweep.
+        Return infinity if it moves from the first tick on, or slowly at first, as in a sweep.
         """
         known_ticks = np.flatnonzero(self.angle_known)
         distance_rad = np.abs(self.angle_rad[known_ticks] - self.angle_rad[known_ticks[0]])
@@ -351,7 +352,7 @@ class Measurement:
             int(known_ticks[np.argmax(distance_rad > fraction * distance_rad.max())])
             for fraction in _MOTION_FRACTIONS
         )
-        return first_tick / self.rate_hz if later_tick < 2 * first_tick else None
+        return first_tick / self.rate_hz if later_tick < 2 * first_tick else math.inf
 
     @property
     def nominal_plant(self) -> Plant:

@@ -71,10 +71,10 @@ def _hidden_response_finding(measurement: Measurement, modal_fit: ModalFit) -> F
     return Finding(
         kind="hidden response",
         sentence=(
-            "The response to the motor cannot be told from a ringing of the beam when the record "
-            "began, because the motor moves too early in the record, or too little. The record "
-            "does not determine inertias, stiffness, delay and orders, and damping ratios only "
-            "roughly."
+            "The response to the motor cannot be distinguished from a ringing of the beam when the "
+            "record began, because the motor moves too early in the record, or too little. The "
+            "record does not determine inertias, stiffness, delay and orders, and damping ratios "
+            "only roughly."
         ),
         remedy=(
             f"Begin the part (--from) at least {period_s:g} s before the motor moves."

@@ -47,7 +47,8 @@ TILTED_AXIS_REASON: Final = "the axis is tilted, and fits to the whole record as
 """Reason against the estimates on an exactly uniform beam if the axis is tilted."""
 
 HIDDEN_RESPONSE_REASON: Final = (
-    "the response to the motor cannot be told from a ringing of the beam when the record began"
+    "the response to the motor cannot be distinguished from a ringing of the beam when the record "
+    "began"
 )
 """Reason against all numbers if the motor moves too early in the record, or too little."""
 

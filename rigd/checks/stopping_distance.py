@@ -93,9 +93,7 @@ def max_stopping_distance(
         return StoppingDistance(inf, inf)
     motor, beam = rig.motor, rig.beam
     inertia_without_beam_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
-    inertia_with_beam_kg_m2 = (
-        inertia_without_beam_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
-    )
+    inertia_with_beam_kg_m2 = inertia_without_beam_kg_m2 + beam.inertia_kg_m2
     speed_rad_s = limits.velocity_rad_s
     driven_distance_rad = 0.0
     step_count = round(torque_duration_s / _SIMULATION_STEP_S)
